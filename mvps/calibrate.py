@@ -1,0 +1,212 @@
+"""Lights without calibration, from a rough shape.
+
+Lambert's law without shadow, for pixel p under light l:   I_pl = b_p . s_l,   b = albedo * normal,   s = intensity * direction.
+A robust rank-3 factorisation gives b and s up to an invertible 3 x 3 matrix A (Hayakawa 1994):
+
+    b = A b',   s = A^-T s',   and   n_p x (A b'_p) = 0     for a rough shape's normals n_p,
+
+nine homogeneous linear equations in A whose null vector, the smallest eigenvector of a 9 x 9 matrix, starts Gauss-Newton steps on
+sum_p rho(|A b'_p / |A b'_p| - n_p|). rho redescends and its scale shrinks (graduated non-convexity, Blake and Zisserman 1987), because
+a hull's normals are exact near the silhouettes and far off in concavities.
+
+Where the lights stand still in the camera's frame (one rig), all pixels of all views are factorised together in camera frames.
+That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations.
+
+Views with fewer than MINIMUM_LIGHTS lights cannot be factorised; there the lights are the least-squares solution of I_pl = n_p . s_l
+for the rough shape's normals, each pixel scaled to a constant albedo by its mean over all views' lights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.mesh import normalise, vertex_normals
+from mvps.scene import Bool, Camera, Capture, Float, Lights, Surface, View
+from mvps.visibility import RayCaster, camera_hits, interpolate
+from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
+
+MINIMUM_LIGHTS = 4
+"""A rank-3 factorisation of three or fewer columns is exact for any data and so says nothing."""
+
+PIXELS_PER_VIEW = 2000
+"""Pixels drawn from a view: three unknowns a light against thousands of equations leave the error to the model, not to sampling."""
+
+SHADOWED = 0.1
+"""Samples below this part of a pixel's bright level are treated as shadowed: Lambert's law gives cos(84 deg) there, and penumbrae and
+inter-reflections are as large."""
+
+BRIGHT_QUANTILE = 0.8
+"""A pixel's bright level: above its shadows, below its highlights."""
+
+POOLED_VARIANCE_RATIO = 2.0
+"""One rig is believed while pooling the views adds less variance than the factors of single views leave."""
+
+ROUGH_NORMAL, FINE_NORMAL = 0.3, 0.05
+"""Scale of the robust angle, radians, from first to last sweep: the error of a visual hull's normals where it bulges over a concavity,
+down to the error of Lambertian normals on glossy objects. Between them the pixels where the hull is not the surface are outvoted."""
+
+AMBIGUITY_SWEEPS = 20
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Lights of all views, and how well the factorisation explains the images.
+
+    residual: relative RMS that three factors leave; fourth_singular_value: over the first one. Both are 0.05 to 0.15 on matte and glossy
+    objects and above 0.25 where there is no diffuse body (metals): there the lights are not to be trusted.
+    """
+
+    lights: Lights
+    residual: float
+    fourth_singular_value: float
+
+
+@dataclass(frozen=True)
+class _Sampled:
+    """Grey images of some pixels of one view: image (n, lights) over its bright level (n,); normal (n, 3) in the camera's frame."""
+
+    image: NDArray[np.float64]
+    bright: Float
+    known: Bool
+    normal: Float
+    noise: float
+
+
+def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> _Sampled:
+    chosen = generator.permutation(len(view.pixels))[:PIXELS_PER_VIEW]
+    hits = camera_hits(caster, view.camera, view.pixels[chosen])
+    chosen, hits = chosen[hits.face >= 0], type(hits)(*(part[hits.face >= 0] for part in hits))
+    image = view.samples[chosen].astype(np.float64).mean(-1) * view.scale
+    bright = np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True)
+    bright = np.maximum(bright, view.scale)
+    known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
+    seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
+    return _Sampled(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)))
+
+
+def _null_vector(pseudo: Float, normal: Float, weight: Float) -> Float:
+    """(3, 3) A that minimises sum_p weight_p |n_p x (A b_p)|^2: the algebraic start."""
+    # n x (A b) = 0 has the rows [n]_x (x) b^T; their Gram matrix is sum_p (1 - n n^T) (x) b b^T.
+    project_out = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    outer = pseudo[:, :, None] * pseudo[:, None, :]
+    gram = np.einsum("p,pij,pkl->ikjl", weight, project_out, outer, optimize=True).reshape(9, 9)
+    A: Float = np.linalg.eigh(gram)[1][:, 0].reshape(3, 3)
+    return A * (1.0 if ((pseudo @ A.T * normal).sum(1) * weight).sum() > 0 else -1.0)
+
+
+def _angle_step(A: Float, pseudo: Float, normal: Float, weight: Float, scale: float) -> Float:
+    """One Gauss-Newton step on sum_p weight_p rho(|A b_p / |A b_p| - n_p|), rho of Geman and McClure 1985 at `scale` radians."""
+    mapped = pseudo @ A.T
+    length = np.maximum(np.linalg.norm(mapped, axis=1, keepdims=True), 1e-12)
+    unit = mapped / length
+    residual = unit - normal
+    robust = weight / (1 + (residual**2).sum(1) / scale**2) ** 2
+    # d unit = (1 - unit unit^T) / length dA b
+    project_out = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / length[:, :, None]
+    jacobian = (project_out[:, :, :, None] * pseudo[:, None, None, :]).reshape(-1, 3, 9)
+    hessian = np.einsum("p,pij,pik->jk", robust, jacobian, jacobian, optimize=True)
+    gradient = np.einsum("p,pij,pi->j", robust, jacobian, residual, optimize=True)
+    # The scale of A is free: a whisper of damping keeps the step from using it.
+    hessian += 1e-9 * np.trace(hessian) * np.eye(9)
+    stepped: Float = A - np.linalg.solve(hessian, gradient).reshape(3, 3)
+    return stepped
+
+
+def solve_ambiguity(pseudo: Float, normal: Float, weight: Float) -> Float:
+    """(3, 3) A with A pseudo_p parallel to normal_p for most pixels; pseudo, normal (n, 3), weight (n,). |det A| = 1.
+
+    Raises numpy.linalg.LinAlgError where the pixels' normals span no volume.
+    """
+    pseudo = pseudo / max(float(np.linalg.norm(pseudo, axis=1).mean()), 1e-300)
+    A = _null_vector(pseudo, normal, weight)
+    for scale in np.geomspace(ROUGH_NORMAL, FINE_NORMAL, AMBIGUITY_SWEEPS):
+        determinant = np.linalg.det(A)
+        if not np.isfinite(A).all() or abs(determinant) < 1e-9 * np.abs(A).max() ** 3:
+            raise np.linalg.LinAlgError("the normals of the rough shape span no volume, so the lights' ambiguity cannot be fixed")
+        A = _angle_step(A / np.cbrt(abs(determinant)), pseudo, normal, weight, float(scale))
+    return A / np.cbrt(abs(np.linalg.det(A)))
+
+
+def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
+    """(lights, 3) intensity times direction in the frame of the samples' normals."""
+    normal = np.concatenate([s.normal for s in samples])
+    A = solve_ambiguity(factors.left, normal, factors.weight.mean(1).astype(np.float64))
+    # The median albedo is the unit, so that lights of separately solved views share one scale.
+    albedo = np.linalg.norm(factors.left @ A.T, axis=1) * np.concatenate([s.bright for s in samples])
+    return factors.right @ np.linalg.inv(A) * np.median(albedo)
+
+
+def _from_normals(sample: _Sampled) -> Float:
+    """(lights, 3) least-squares lights for the rough shape's normals and one albedo: the case of few lights."""
+    lit = sample.known.astype(np.float64)
+    absolute = sample.image
+    lights = solve_rows(absolute.T, lit.T, sample.normal)
+    for _ in range(AMBIGUITY_SWEEPS):
+        residual = absolute - sample.normal @ lights.T
+        weights = robust_weights(residual.T, lit.T, sample.noise)
+        lights = solve_rows(absolute.T, weights, sample.normal)
+    return lights * np.median(sample.bright)
+
+
+def colour_ratios(view: View) -> Float:
+    """(lights, 3) intensity of each light's channels over their mean, from the colour of the whole view: the object's mean
+    albedo is taken as the mean over all lights, so only differences between lights count."""
+    total = view.samples.astype(np.float64).sum(0) if view.samples.nbytes < 1 << 26 else _blockwise_sum(view)
+    total = np.maximum(total, 1.0)
+    chroma = total / total.mean(1, keepdims=True)
+    ratio = chroma / np.median(chroma, axis=0)
+    return ratio / ratio.mean(1, keepdims=True)
+
+
+def _blockwise_sum(view: View) -> Float:
+    return np.sum([view.samples[i : i + 4096].astype(np.float64).sum(0) for i in range(0, len(view.samples), 4096)], axis=0)
+
+
+def normalised(directions: list[Float], intensities: list[Float], one_rig: bool) -> Lights:
+    """Lights with intensities scaled to a mean of one over all lights and channels."""
+    mean = float(np.mean(np.concatenate(intensities)))
+    return Lights(tuple(directions), tuple(e / mean for e in intensities), one_rig)
+
+
+def _to_world(scaled: Float, camera: Camera, ratio: Float) -> tuple[Float, Float]:
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    return scaled / length @ camera.rotation, length * ratio
+
+
+def uncalibrated_lights(capture: Capture, surface: Surface, seed: int) -> Calibration:
+    """Directions and intensities of all lights from the images and a rough surface's normals (module docstring)."""
+    generator = np.random.default_rng(seed)
+    caster, normal = RayCaster(surface), vertex_normals(surface)
+    samples = [_sampled(view, caster, normal, generator) for view in capture.views]
+    counts = {len(view.lights) for view in capture.views}
+    if min(counts) < MINIMUM_LIGHTS:
+        scaled = [_from_normals(sample) for sample in samples]
+        return Calibration(_assemble(capture, scaled, False), float("nan"), float("nan"))
+    separate = [factorise(s.image, s.known, 3, floor=s.noise) for s in samples]
+    residual = float(np.sqrt(np.mean([f.residual**2 for f in separate])))
+    fourth = float(np.mean([f.singular_values[3] for f in separate]))
+    if len(capture.views) > 1 and len(counts) == 1 and len({view.lights for view in capture.views}) == 1:
+        together = factorise(
+            np.concatenate([s.image for s in samples]),
+            np.concatenate([s.known for s in samples]),
+            3,
+            floor=float(np.median([s.noise for s in samples])),
+        )
+        if together.residual**2 < POOLED_VARIANCE_RATIO * residual**2:
+            rig = _scaled_lights(together, samples)
+            lights = _assemble(capture, [rig] * len(samples), True)
+            return Calibration(lights, together.residual, float(together.singular_values[3]))
+    scaled = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
+    return Calibration(_assemble(capture, scaled, False), residual, fourth)
+
+
+def _assemble(capture: Capture, scaled: list[Float], one_rig: bool) -> Lights:
+    ratios = [colour_ratios(view) for view in capture.views]
+    if one_rig:
+        mean = np.mean(ratios, axis=0)
+        ratios = [mean] * len(ratios)
+    pairs = [_to_world(s, view.camera, r) for s, view, r in zip(scaled, capture.views, ratios, strict=True)]
+    return normalised([d for d, _ in pairs], [e for _, e in pairs], one_rig)

@@ -1,0 +1,98 @@
+"""Pixels <-> rays <-> points, for a pinhole camera.
+
+    x_camera = R x_world + t,      (x, y, 1) ~ K x_camera,      depth = z of x_camera
+
+The only place that knows where pixel centres are: the pixel of row r and column c has its centre at (c + 0.5, r + 0.5).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.scene import Bool, Camera, Float, Int
+
+DILIGENT_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
+"""Axes of DiLiGenT's lights and normals (x right, y up, z towards the camera) from OpenCV camera axes; its own inverse."""
+
+
+def project(camera: Camera, points: Float) -> tuple[Float, Float]:
+    """Image coordinates (..., 2) in pixels and depth (...,) of world points (..., 3)."""
+    local = points @ camera.rotation.T + camera.translation
+    depth = local[..., 2]
+    image = local @ camera.K.T
+    return image[..., :2] / image[..., 2:], depth
+
+
+def unproject(camera: Camera, image: Float, depth: Float) -> Float:
+    """World points (..., 3) at image coordinates (..., 2) and depth (...,)."""
+    homogeneous = np.concatenate([image, np.ones_like(image[..., :1])], -1)
+    local = homogeneous @ np.linalg.inv(camera.K).T * np.asarray(depth)[..., None]
+    points: Float = (local - camera.translation) @ camera.rotation
+    return points
+
+
+def rays(camera: Camera, image: Float) -> tuple[Float, Float]:
+    """Origins (..., 3) (the camera's centre) and unit directions (..., 3) in the world, through image coordinates (..., 2)."""
+    homogeneous = np.concatenate([image, np.ones_like(image[..., :1])], -1)
+    direction = homogeneous @ np.linalg.inv(camera.K).T @ camera.rotation
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    return np.broadcast_to(camera.centre, direction.shape).copy(), direction
+
+
+def pixel_centres(pixels: Int) -> Float:
+    """Image coordinates (..., 2) of the centres of pixels given as (..., 2) row and column."""
+    centres: Float = np.asarray(pixels)[..., ::-1] + 0.5
+    return centres
+
+
+def view_directions(camera: Camera, points: Float) -> Float:
+    """Unit vectors (..., 3), world frame, from points towards the camera."""
+    towards = camera.centre - points
+    unit: Float = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    return unit
+
+
+def footprint(camera: Camera, points: Float) -> Float:
+    """Side length (...,) in world units that one pixel covers at the depth of the points (..., 3)."""
+    side: Float = project(camera, points)[1] / camera.focal_length
+    return side
+
+
+def pixel_footprint(cameras: list[Camera], point: Float) -> float:
+    """Median side length of a pixel at a world point (3,) over several cameras: the natural unit of length of a capture."""
+    return float(np.median([footprint(camera, point) for camera in cameras]))
+
+
+def inside_image(camera: Camera, image: Float) -> Bool:
+    """(...,) True where image coordinates (..., 2) lie on the image."""
+    inside: Bool = (image >= 0).all(-1) & (image[..., 0] < camera.width) & (image[..., 1] < camera.height)
+    return inside
+
+
+def bilinear(index: Int, image: Float) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Bilinear interpolation between foreground pixels.
+
+    index (height, width) is View.pixel_index; image (n, 2) are image coordinates. Returns the positions (n, 4) of the
+    four nearest pixels in the foreground list and their weights (n, 4), which sum to 1 over the foreground ones
+    (background pixels get weight 0 and position 0) or to 0 where all four are background.
+    """
+    height, width = index.shape
+    x, y = image[:, 0] - 0.5, image[:, 1] - 0.5
+    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    fx, fy = x - column, y - row
+    positions = np.empty((len(image), 4), np.int32)
+    weights = np.empty((len(image), 4), np.float32)
+    corners: list[tuple[int, int, Any]] = [(0, 0, (1 - fy) * (1 - fx)), (0, 1, (1 - fy) * fx), (1, 0, fy * (1 - fx)), (1, 1, fy * fx)]
+    for k, (dr, dc, weight) in enumerate(corners):
+        r, c = row + dr, column + dc
+        on = (r >= 0) & (r < height) & (c >= 0) & (c < width)
+        position = np.where(on, index[np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)], -1)
+        positions[:, k] = np.maximum(position, 0)
+        weights[:, k] = np.where(position >= 0, weight, 0)
+    total = weights.sum(1, keepdims=True)
+    np.divide(weights, total, out=weights, where=total > 1e-6)
+    weights[total[:, 0] <= 1e-6] = 0
+    return positions, weights

@@ -1,0 +1,103 @@
+"""What every command line of the program shares: options, exit codes and the one sentence for bad input.
+
+exit code   0 done,  2 bad input (one sentence on standard error),  130 interrupted,  141 the reader of a pipe went away
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from mvps.progress import ConsoleHandler
+from mvps.scene import CaptureError
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser whose complaints are a CaptureError, so that bad options read like all other bad input."""
+
+    def error(self, message: str) -> NoReturn:
+        raise CaptureError(f"{message}; see {self.prog} --help")
+
+
+class _Help(argparse.ArgumentDefaultsHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Defaults after every option, the description's lines as written."""
+
+
+def parser(module: str, description: str) -> Parser:
+    """A parser for `python -m MODULE` with --quiet and --verbose; parse with `parse`."""
+    made = Parser(prog=f"python -m {module}", description=description, formatter_class=_Help)
+    shown = made.add_mutually_exclusive_group()
+    shown.add_argument("--quiet", action="store_true", help="show no progress, only warnings and errors")
+    shown.add_argument("--verbose", action="store_true", help="show every step")
+    return made
+
+
+def parse(made: Parser, argv: Sequence[str]) -> argparse.Namespace:
+    """The arguments; --quiet and --verbose take effect on the logger "mvps"."""
+    arguments = made.parse_args(argv)
+    logger = logging.getLogger("mvps")
+    logger.setLevel(logging.WARNING if arguments.quiet else logging.DEBUG if arguments.verbose else logging.INFO)
+    if not any(isinstance(handler, ConsoleHandler) for handler in logger.handlers):
+        logger.addHandler(ConsoleHandler())
+    return arguments
+
+
+def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:
+    """Run a command with these arguments (None: those of the process) and return its exit code."""
+    try:
+        main(sys.argv[1:] if argv is None else argv)
+        sys.stdout.flush()
+    except CaptureError as error:
+        return _complain(str(error))
+    except ValueError as error:
+        # Checks on what the user gave say wanted and given; any other ValueError is a fault of the program and keeps its trace.
+        if "wanted" not in str(error):
+            raise
+        return _complain(str(error))
+    except BrokenPipeError:
+        # What is still buffered would raise once more when the interpreter closes standard output.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _complain(f"{error.filename}: {error.strerror}; check the path, its permissions and the free space")
+    except KeyboardInterrupt:
+        print("mvps: interrupted before the end", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _complain(message: str) -> int:
+    print(f"mvps: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def number_list(text: str) -> tuple[int, ...]:
+    """Numbers counted from 1, separated by commas: "1,5,9" -> (1, 5, 9)."""
+    numbers = tuple(int(word) for word in text.split(",") if word.strip().isdecimal())
+    if not numbers or len(numbers) != text.count(",") + 1 or min(numbers) < 1:
+        raise argparse.ArgumentTypeError(f"wanted numbers from 1, separated by commas, such as 1,5,9, given {text!r}")
+    return numbers
+
+
+def lights_argument(text: str) -> tuple[int, ...] | Mapping[str, tuple[int, ...]]:
+    """Numbers of lights for all views, "1,8,16", or the path of a JSON file with a list per view, {"view_01": [1, 8]}."""
+    if not text.strip() or set(text) <= set("0123456789, -+"):
+        return number_list(text)
+    try:
+        lights = json.loads(Path(text).read_bytes())
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"{text}: wanted a JSON file, or numbers such as 1,5,9, given {error.strerror}") from None
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text}: wanted JSON, given text that is none ({error})") from None
+    good = isinstance(lights, dict) and bool(lights)
+    if not good or not all(isinstance(v, list) and v and all(type(n) is int and n >= 1 for n in v) for v in lights.values()):
+        raise argparse.ArgumentTypeError(f'{text}: wanted a list of numbers from 1 per view, such as {{"view_01": [1, 8]}}')
+    return {str(view): tuple(numbers) for view, numbers in lights.items()}

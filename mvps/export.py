@@ -1,0 +1,182 @@
+"""A reconstruction as a folder of files, and back.
+
+    mesh.ply                 vertices (world frame, units of the capture), refined normals, albedo as sRGB vertex colour
+    model.glb                textured physically based model;  model.obj, .mtl and textures likewise   (where textures are given)
+    lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
+                                 "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
+    material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,)
+    normals/NAME.npy, .png   (height, width, 3) float32 world frame, NaN outside the mask; the picture shows (normal + 1) / 2
+    report.html              where one is given
+    metrics.json, settings.json
+
+Numbers are stored exactly (doubles in the PLY and NPZ files, shortest exact decimals in JSON), so reading gives back what
+was written, and writing the same reconstruction twice gives the same bytes. The folder appears whole: it is written
+beside its place, on the same file system, and renamed.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from mvps.folders import appearing_whole
+from mvps.gltf import glb_bytes
+from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
+from mvps.pbr import reflectance_scale, srgb_bytes
+from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Surface
+from mvps.texture import Textures, png_bytes
+
+RESULT_MARKS = ("settings.json", "mesh.ply")
+"""Files by which a folder is known as an earlier result, which may be replaced."""
+
+
+def write_reconstruction(reconstruction: Reconstruction, folder: Path, textures: Textures | None = None, report: str = "") -> None:
+    """Write a result folder, whole or not at all.
+
+    An empty folder or an earlier result at the same place is replaced; CaptureError where something else is there. Without
+    `textures` (see mvps.texture.bake) the textured models are left out, without a `report` (HTML) report.html is.
+    ValueError where metrics or settings are not plain JSON values.
+    """
+    files = {
+        "lights.json": _json("lights", _lights_record(reconstruction), sort=False),
+        "metrics.json": _json("metrics", reconstruction.metrics),
+        "settings.json": _json("settings", reconstruction.settings),
+    }
+    with appearing_whole(folder, RESULT_MARKS) as writing:
+        files |= _mesh_files(reconstruction)
+        if textures is not None:
+            files |= _model_files(reconstruction, textures)
+        if report:
+            files["report.html"] = report.encode("utf-8")
+        for name, content in files.items():
+            (writing / name).write_bytes(content)
+        (writing / "normals").mkdir()
+        for view, normals in zip(reconstruction.views, reconstruction.normal_maps, strict=True):
+            np.save(writing / "normals" / f"{view}.npy", np.asarray(normals, np.float32))
+            (writing / "normals" / f"{view}.png").write_bytes(png_bytes(normal_picture(normals)))
+
+
+def read_reconstruction(folder: Path) -> Reconstruction:
+    """The reconstruction in a result folder. CaptureError where a file is missing, damaged or does not fit the others."""
+    folder = Path(folder)
+    wanted = ("mesh.ply", "material.npz", "lights.json", "metrics.json", "settings.json")
+    missing = [name for name in wanted if not (folder / name).is_file()]
+    if missing:
+        raise CaptureError(
+            f"{folder}: wanted a result folder, given one without {', '.join(missing)}; give the folder that mvps.reconstruct --out wrote"
+        )
+    mesh = read_ply(folder / "mesh.ply")
+    record = _read_json(folder / "lights.json")
+    views = tuple(record["views"])
+    try:
+        with np.load(folder / "material.npz") as arrays:
+            material = Material(normal=mesh.normals, **{name: arrays[name] for name in _MATERIAL})
+        return Reconstruction(
+            surface=Surface(mesh.vertices, mesh.faces),
+            material=material,
+            lights=Lights(
+                direction=tuple(_rows(record, view, "direction") for view in views),
+                intensity=tuple(_rows(record, view, "intensity") for view in views),
+                one_rig=bool(record["one_rig"]),
+            ),
+            views=views,
+            light_names=tuple(tuple(record["views"][view]["lights"]) for view in views),
+            normal_maps=tuple(np.load(folder / "normals" / f"{view}.npy") for view in views),
+            metrics=_read_json(folder / "metrics.json"),
+            settings=_read_json(folder / "settings.json"),
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+        raise CaptureError(f"{folder}: wanted a whole result, given a damaged one ({error}); run mvps.reconstruct again") from error
+
+
+_MATERIAL = ("albedo", "specular_weight", "sharpness", "confidence")
+
+
+def normal_picture(normals: Float) -> Any:
+    """(height, width, 3) uint8 picture of normals (height, width, 3): (normal + 1) / 2; black where NaN."""
+    return np.nan_to_num(np.rint((np.asarray(normals, np.float64) + 1) * 127.5), nan=0).clip(0, 255).astype(np.uint8)
+
+
+def _lights_record(reconstruction: Reconstruction) -> dict[str, Any]:
+    lights = reconstruction.lights
+    rows = zip(reconstruction.views, reconstruction.light_names, lights.direction, lights.intensity, strict=True)
+    views = {
+        view: {"lights": [int(n) for n in numbers], "direction": direction.tolist(), "intensity": intensity.tolist()}
+        for view, numbers, direction, intensity in rows
+    }
+    # Not sorted by name: the order is that of the views.
+    return {"one_rig": lights.one_rig, "views": views}
+
+
+def _rows(record: dict[str, Any], view: str, name: str) -> Float:
+    rows = np.array(record["views"][view][name], dtype=np.float64).reshape(-1, 3)
+    if len(rows) != len(record["views"][view]["lights"]):
+        raise ValueError(f"lights.json: wanted {len(record['views'][view]['lights'])} rows of {name} for {view}, given {len(rows)}")
+    return rows
+
+
+def _json(name: str, value: Any, sort: bool = True) -> bytes:
+    try:
+        text = json.dumps(value, indent=1, sort_keys=sort, allow_nan=False, ensure_ascii=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: wanted plain JSON values (finite numbers, text, lists, dicts with text keys), given {error}") from error
+    return (text + "\n").encode("utf-8")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CaptureError(f"{path}: wanted JSON, given something else ({error}); run mvps.reconstruct again") from error
+    if not isinstance(value, dict) or (path.name == "lights.json" and not isinstance(value.get("views"), dict)):
+        raise CaptureError(f"{path}: wanted a JSON object as mvps.reconstruct writes it, given another; run mvps.reconstruct again")
+    return value
+
+
+def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
+    surface, material = reconstruction.surface, reconstruction.material
+    scale = reflectance_scale(material)
+    colours = srgb_bytes(material.albedo / scale)
+    mesh = PlyMesh(surface.vertices, material.normal, colours, surface.faces)
+    arrays = io.BytesIO()
+    np.savez(arrays, allow_pickle=False, **{name: getattr(material, name) for name in _MATERIAL})
+    comment = f"colour = sRGB of albedo / {scale:.9g}; the normal is the refined shading normal"
+    return {"mesh.ply": ply_bytes(mesh, comment), "material.npz": arrays.getvalue()}
+
+
+def _model_files(reconstruction: Reconstruction, textures: Textures) -> dict[str, bytes]:
+    surface = reconstruction.surface
+    images = {
+        "model_base_color.png": png_bytes(textures.base_color),
+        "model_normal.png": png_bytes(textures.normal_map),
+        "model_roughness.png": png_bytes(textures.roughness),
+        "model_specular.png": png_bytes(textures.specular_color),
+    }
+    atlas = textures.atlas
+    obj = obj_bytes(surface.vertices, textures.mesh_normal, atlas.uv, surface.faces, atlas.faces, "model")
+    return images | {
+        "model.glb": glb_bytes(surface.vertices, textures),
+        "model.obj": obj,
+        "model.mtl": _mtl(textures),
+    }
+
+
+def _mtl(textures: Textures) -> bytes:
+    """Wavefront material with the physically based extension of Clara.io (Pr: roughness, Pm: metallic, norm: normal map)."""
+    lines = [
+        "newmtl model",
+        "Kd 1 1 1",
+        "map_Kd model_base_color.png",
+        "Ks" + f" {textures.specular_level:.6g}" * 3,
+        "map_Ks model_specular.png",
+        "Pm 0",
+        "map_Pr model_roughness.png",
+        "norm model_normal.png",
+        "",
+    ]
+    return "\n".join(lines).encode("ascii")

@@ -1,0 +1,53 @@
+"""Folders that appear whole: written beside their place, on the same file system, and renamed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mvps.scene import CaptureError
+
+
+@contextmanager
+def appearing_whole(folder: Path, marks: tuple[str, ...] = ()) -> Iterator[Path]:
+    """A folder to write into, which takes its place at `folder` when the block ends well and vanishes when it does not.
+
+    The place must be free, an empty folder, or a folder with all the files named in `marks`, by which an earlier output of the
+    same kind is known; that one is replaced. CaptureError where something else is there.
+    """
+    place = Path(folder).resolve()
+    _check_place(place, marks)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    writing, aside = (place.with_name(f".{place.name}.{os.getpid()}.{use}") for use in ("writing", "replaced"))
+    writing.mkdir()
+    try:
+        yield writing
+        # Someone may have put something there in the meantime.
+        _check_place(place, marks)
+        if not place.exists():
+            writing.rename(place)
+            return
+        place.rename(aside)
+        try:
+            writing.rename(place)
+        except OSError:
+            aside.rename(place)
+            raise
+        shutil.rmtree(aside)
+    finally:
+        if writing.exists():
+            shutil.rmtree(writing)
+
+
+def _check_place(place: Path, marks: tuple[str, ...]) -> None:
+    if not place.exists():
+        return
+    if not place.is_dir():
+        raise CaptureError(f"{place}: wanted a folder to write to, given a file; give another --out")
+    earlier = bool(marks) and all((place / name).is_file() for name in marks)
+    if any(place.iterdir()) and not earlier:
+        wanted = "a new or empty folder or an earlier result" if marks else "a new or empty folder"
+        raise CaptureError(f"{place}: wanted {wanted}, given a folder with other files; give another --out or empty this one")

@@ -1,0 +1,151 @@
+"""The visual hull: intersection of the silhouette cones, as a signed distance on a grid.
+
+For view i let m_i(x) be the signed distance in pixels from the projection of x to the boundary of the mask, negative inside.
+At depth z_i a pixel covers z_i / f_i world units, so
+
+    d(x) = max_i m_i(x) z_i / f_i
+
+is zero on the hull and a lower bound of the distance near it (Laurentini 1994 for the hull). A mask's boundary runs between
+the centres of its last foreground and its first background pixel, half a pixel from either.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from skimage.measure import marching_cubes
+
+from mvps.camera import inside_image, pixel_footprint, project
+from mvps.mesh import largest_component
+from mvps.scene import Bool, Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
+
+MARGIN_CELLS = 3
+"""Cells of free space kept around the hull, so that the level set closes inside the grid."""
+
+STAIRCASE_PIXELS = 1.0
+"""Standard deviation, pixels, that smooths the distance to a binary mask: its boundary is a staircase of one-pixel steps. A straight
+boundary stays where it is; one of radius r pixels moves by 1 / (2 r) pixels."""
+
+REMAP_LIMIT = 1 << 14
+"""Points per call of cv2.remap, which takes no side longer than a signed 16-bit integer."""
+
+MINIMUM_CELLS_ACROSS = 8
+"""A hull thinner than this many coarse cells is no solid that masks could have made."""
+
+
+def mask_distance(mask: Bool) -> NDArray[np.float32]:
+    """(height, width) signed distance in pixels from pixel centres to the mask's boundary, negative inside."""
+    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    signed: NDArray[np.float32] = np.where(mask, 0.5 - inside, outside - 0.5).astype(np.float32)
+    return cv2.GaussianBlur(signed, (0, 0), STAIRCASE_PIXELS, borderType=cv2.BORDER_REPLICATE)
+
+
+def bounds(capture: Capture) -> tuple[Float, Float]:
+    """Corners (3,), (3,) of the smallest axis-parallel box that holds the intersection of the masks' bounding pyramids.
+
+    Each mask's bounding rectangle cuts half-spaces a . x <= b from the world; six linear programmes find the box.
+    Raises CaptureError where the pyramids do not meet or leave the object unbounded (one view, or wrong poses).
+    """
+    normals, offsets = [], []
+    for view in capture.views:
+        rows, columns = np.nonzero(view.mask)
+        P = view.camera.K @ np.column_stack([view.camera.rotation, view.camera.translation])
+        sides = [(columns.min(), 0, 1.0), (columns.max() + 1, 0, -1.0), (rows.min(), 1, 1.0), (rows.max() + 1, 1, -1.0)]
+        for limit, axis, sign in sides:
+            plane = sign * (limit * P[2] - P[axis])
+            normals.append(plane[:3]), offsets.append(-plane[3])
+        normals.append(-P[2, :3]), offsets.append(P[2, 3])
+    A, b = np.array(normals), np.array(offsets)
+    scale = np.linalg.norm(A, axis=1)
+    # Distances to the first camera's centre as the unit keep the programme well scaled in any unit of the capture.
+    origin = np.mean([view.camera.centre for view in capture.views], axis=0)
+    unit = max(float(np.linalg.norm(view.camera.centre - origin)) for view in capture.views) or 1.0
+    A, b = A / scale[:, None], (b / scale - A @ origin / scale) / unit
+    corners = np.empty((2, 3))
+    for axis in range(3):
+        for side, sign in enumerate((1.0, -1.0)):
+            solution = linprog(sign * np.eye(3)[axis], A, b, bounds=(None, None), method="highs")
+            if solution.status != 0:
+                why = "do not meet in one place" if solution.status == 2 else "leave the object unbounded"
+                raise CaptureError(
+                    f"{capture.name}: wanted masks and cameras that enclose one object, given {len(capture.views)} views whose"
+                    f" silhouettes {why}; check Calib_Results.mat and the masks, or use views from more sides"
+                )
+            corners[side, axis] = solution.x[axis]
+    return corners[0] * unit + origin, corners[1] * unit + origin
+
+
+def _distance(view: View, field: NDArray[np.float32], points: Float) -> NDArray[np.float32]:
+    """Signed distance of world points (n, 3) to one view's silhouette cone, world units, -inf where the view cannot tell."""
+    image, depth = project(view.camera, points)
+    image = image.astype(np.float32)
+    pixels = np.empty(len(image), np.float32)
+    for start in range(0, len(image), REMAP_LIMIT):
+        part = image[start : start + REMAP_LIMIT]
+        x, y = part[None, :, 0] - 0.5, part[None, :, 1] - 0.5
+        pixels[start : start + len(part)] = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    # Beyond the image nothing was photographed: such points are outside, at least by their distance to the image.
+    outside = ~inside_image(view.camera, image)
+    limit = np.array([view.camera.width, view.camera.height])
+    beyond = np.linalg.norm(np.maximum(np.maximum(-image, image - limit), 0), axis=-1)
+    distance = np.where(outside, np.maximum(pixels, 0.5) + beyond, pixels) * depth / view.camera.focal_length
+    return np.where(depth > 0, distance, np.inf).astype(np.float32)
+
+
+def _cut(capture: Capture, points: Float) -> NDArray[np.float32]:
+    distance = np.full(len(points), -np.inf, np.float32)
+    for view in capture.views:
+        np.maximum(distance, _distance(view, mask_distance(view.mask), points), out=distance)
+    return distance
+
+
+def _grid_points(origin: Float, spacing: float, shape: tuple[int, int, int]) -> Float:
+    axes = [origin[k] + spacing * np.arange(shape[k]) for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+
+def _sample(capture: Capture, low: Float, high: Float, cells: int) -> SignedDistanceGrid:
+    spacing = float((high - low).max()) / cells
+    origin = low - MARGIN_CELLS * spacing
+    shape = tuple(int(n) for n in np.ceil((high - low) / spacing).astype(int) + 2 * MARGIN_CELLS + 1)
+    values = _cut(capture, _grid_points(origin, spacing, shape)).reshape(shape)
+    return SignedDistanceGrid(values, origin, spacing)
+
+
+def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
+    """The hull's signed distance on a grid of `cells` along the longest side of the object.
+
+    A coarse grid over `bounds` finds the hull's own box first. Raises CaptureError where no point is inside all masks.
+    """
+    low, high = bounds(capture)
+    coarse = _sample(capture, low, high, min(cells, 32))
+    # A cell whose corner is nearer than its diagonal to the hull may hold a part of it.
+    inside = np.argwhere(coarse.values < coarse.spacing * np.sqrt(3))
+    if not (coarse.values < coarse.spacing).any() or len(inside) < MINIMUM_CELLS_ACROSS:
+        raise CaptureError(
+            f"{capture.name}: wanted masks that agree on one object, given {len(capture.views)} masks whose common part is empty;"
+            " check that masks and poses belong together"
+        )
+    low = np.maximum(low, coarse.origin + coarse.spacing * (inside.min(0) - 1))
+    high = np.minimum(high, coarse.origin + coarse.spacing * (inside.max(0) + 1))
+    return _sample(capture, low, high, cells)
+
+
+def visual_hull(grid: SignedDistanceGrid) -> Surface:
+    """The zero level set, largest component, faces outwards, world units."""
+    if not grid.values.min() < 0 < grid.values.max():
+        raise CaptureError(
+            "visual hull: wanted masks that agree on one object, given masks whose common part is empty; check masks and poses"
+        )
+    vertices, faces, _, _ = marching_cubes(np.array(grid.values), 0.0)
+    return largest_component(Surface(grid.origin + grid.spacing * vertices.astype(np.float64), faces))
+
+
+def default_cells(capture: Capture) -> int:
+    """Cells along the object so that one cell is about two pixels: below that the masks themselves carry no shape."""
+    low, high = bounds(capture)
+    pixel = pixel_footprint([view.camera for view in capture.views], (low + high) / 2)
+    return int(np.clip(round(float((high - low).max()) / (2 * pixel)), 24, 192))

@@ -1,0 +1,171 @@
+"""The photometric blocks of the joint problem: vertices (normal and reflectance) and lights.
+
+For a vertex with normal n, grey albedo a and lobe weights w_k, seen along v under light m = e l (e intensity, l unit):
+
+    c = |v + l| = sqrt(2 + 2 v.l),   h.n = (n.v + n.l) / c,   E_k = exp(s_k (h.n - 1)),   q = e max(n.l, 0)
+    I = q (a + sum_k w_k E_k)
+
+    dI/dn = e [n.l > 0] (a + sum w E) l + q B (l + v) / c,             B = sum_k s_k w_k E_k
+    dI/da = q,   dI/dw_k = q E_k
+    dI/dm = [n.l > 0] (a + sum w E) n + max(n.l, 0) B (1 - l l^T) (n / c - (h.n) v / c^2)          (the half vector moves with the light)
+
+Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale per vertex, the standard deviation of its weighted residuals.
+Every block is Gauss-Newton: normal equations are accumulated over chunks of pairs, never a Jacobian as a whole, and add up over views.
+Chunks are single-threaded and views are dealt to threads: torch's own threads would meet at a barrier after every one of some thirty
+small operations.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvps.joint.observe import ViewSamples
+from mvps.shading import PARALLEL, half_dot_normal
+from solvers.low_rank import CAUCHY_95
+
+WORKERS = 2
+"""Parts that the views are dealt into: fixed, because the order of a sum is part of its value. Two is what a laptop's cores keep busy."""
+
+
+@dataclass
+class Vertices:
+    """What is known about the vertices: normal (V, 3); reflectance (V, 1 + lobes) grey albedo and weights; scale (V,) of residuals."""
+
+    normal: Tensor
+    reflectance: Tensor
+    scale: Tensor
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Sums over samples: hessian (n, p, p), gradient (n, p), squares (n,) weighted squared residuals, count (n,) weights."""
+
+    hessian: Tensor
+    gradient: Tensor
+    squares: Tensor
+    count: Tensor
+
+
+def tangents(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors (n, 3) that complete unit normals (n, 3) to a frame (Duff et al. 2017)."""
+    x, y, z = normal.unbind(-1)
+    sign = torch.where(z >= 0, 1.0, -1.0).to(normal.dtype)
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], -1)
+    second = torch.stack([b, sign + y * y * a, -y], -1)
+    return first, second
+
+
+@dataclass(frozen=True)
+class DirectionalLights:
+    """Lights of one view: direction (lights, 3) unit, world; intensity (lights,) mean of the channels."""
+
+    direction: Tensor
+    intensity: Tensor
+
+
+@dataclass(frozen=True)
+class Shaded:
+    """The image model on a chunk of pairs, (n, lights) each: lit 1 above the horizon; n . l; h . n; c; basis q and q E_k;
+    reflectance a + sum w E; slope B; predicted I."""
+
+    lit: Tensor
+    n_dot_l: Tensor
+    half: Tensor
+    c: Tensor
+    basis: list[Tensor]
+    reflectance: Tensor
+    slope: Tensor
+    predicted: Tensor
+
+
+def evaluate(normal: Tensor, reflectance: Tensor, towards: Tensor, lights: DirectionalLights, sharpness: Tensor) -> Shaded:
+    """The image model for normal, towards (n, 3) and reflectance (n, 1 + lobes) under all lights of a view."""
+    light, intensity = lights.direction, lights.intensity
+    n_dot_l = normal @ light.T
+    v_dot_l = towards @ light.T
+    half = half_dot_normal((normal * towards).sum(-1, keepdim=True), n_dot_l, v_dot_l)
+    c = (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
+    q = n_dot_l.clamp_min(0) * intensity
+    total = reflectance[:, :1].expand_as(q)
+    slope = torch.zeros_like(q)
+    basis = [q]
+    for k, s in enumerate(sharpness.tolist()):
+        lobe = torch.exp(s * (half - 1))
+        weighted = lobe * reflectance[:, k + 1, None]
+        total = total + weighted
+        slope = slope + s * weighted
+        basis.append(q * lobe)
+    return Shaded((n_dot_l > 0).to(q.dtype), n_dot_l, half, c, basis, total, slope, q * total)
+
+
+def vertex_jacobian(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> Tensor:
+    """(n, 3 + lobes, lights) derivatives of the samples by two tangential steps of the normal, the albedo and the weights."""
+    along_light = shaded.lit * lights.intensity * shaded.reflectance
+    along_half = shaded.basis[0] * shaded.slope / shaded.c
+    both = along_light + along_half
+    columns = [both * (t @ lights.direction.T) + along_half * (t * towards).sum(-1, keepdim=True) for t in frame]
+    return torch.stack(columns + shaded.basis, 1)
+
+
+def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: DirectionalLights, rotation: Tensor) -> Tensor:
+    """(n, lights, 3) derivatives of the samples by m = intensity * direction in the camera's frame (rotation: camera_from_world)."""
+    along_half = shaded.n_dot_l.clamp_min(0) * shaded.slope / shaded.c
+    # dI/dm = alpha n + beta v + gamma l
+    alpha = shaded.lit * shaded.reflectance + along_half
+    beta = -along_half * shaded.half / shaded.c
+    v_dot_l = shaded.c**2 / 2 - 1
+    gamma = -(along_half * shaded.n_dot_l + beta * v_dot_l)
+    return (
+        alpha[..., None] * (normal @ rotation.T)[:, None]
+        + beta[..., None] * (towards @ rotation.T)[:, None]
+        + gamma[..., None] * (lights.direction @ rotation.T)[None]
+    )
+
+
+def robust(residual: Tensor, scale: Tensor) -> Tensor:
+    """Cauchy's weight of residuals (n, lights) with scale (n,)."""
+    return 1 / (1 + (residual / (CAUCHY_95 * scale[:, None])) ** 2)
+
+
+def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor) -> NormalEquations:
+    n, p = len(vertices.normal), 2 + vertices.reflectance.shape[1]
+    like = vertices.normal
+    hessian, gradient = like.new_zeros(n, p, p), like.new_zeros(n, p)
+    squares, count = like.new_zeros(n), like.new_zeros(n)
+    first, second = tangents(vertices.normal)
+    for samples, of_view in zip(views, lights, strict=True):
+        for part in samples.chunks():
+            index, towards = samples.vertex[part], samples.towards[part]
+            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, sharpness)
+            residual = shaded.predicted - samples.image[part]
+            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
+            jacobian = vertex_jacobian(shaded, (first[index], second[index]), towards, of_view)
+            weighted = jacobian * weight[:, None]
+            hessian.index_add_(0, index, weighted @ jacobian.transpose(1, 2))
+            gradient.index_add_(0, index, (weighted @ residual[..., None])[..., 0])
+            squares.index_add_(0, index, (weight * residual**2).sum(1))
+            count.index_add_(0, index, weight.sum(1))
+    return NormalEquations(hessian, gradient, squares, count)
+
+
+def vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor) -> NormalEquations:
+    """Normal equations of every vertex at the current state, unknowns as in `vertex_jacobian`.
+
+    The views are dealt out to the cores in a fixed order and their sums added in that order, so that the result does not
+    depend on which core was faster.
+    """
+    hands = min(WORKERS, len(views))
+    with ThreadPoolExecutor(hands) as pool:
+        parts = list(pool.map(lambda k: _vertex_equations(views[k::hands], vertices, lights[k::hands], sharpness), range(hands)))
+    total = parts[0]
+    for part in parts[1:]:
+        total = NormalEquations(
+            total.hessian + part.hessian, total.gradient + part.gradient, total.squares + part.squares, total.count + part.count
+        )
+    return total

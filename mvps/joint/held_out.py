@@ -1,0 +1,102 @@
+"""Lights of photographs that were kept back, for a finished reconstruction: normals and reflectance stand still.
+
+Start: least squares of Lambert's part, I = a n . m, then Gauss-Newton on the whole image model (blocks.py) with shadows traced anew.
+Views of one rig share their lights; the rig's lights carry over to a view that was kept back without any fit.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
+from mvps.joint.observe import ViewSamples, channel_ratio, observe
+from mvps.joint.reflectance import colours
+from mvps.scene import Capture, Float, Lights, Material, Surface
+
+STEPS = 6
+
+
+def carried_over(lights: Lights, rotations: list[Float], rotation: Float) -> tuple[Float, Float]:
+    """Direction and intensity (lights, 3) of a rig's lights in a view with camera_from_world `rotation`, from its first view."""
+    return np.asarray(lights.direction[0]) @ rotations[0].T @ rotation, np.asarray(lights.intensity[0])
+
+
+def _vertices(material: Material) -> Vertices:
+    reflectance = np.column_stack([material.albedo.mean(1), material.specular_weight])
+    normal, values = (torch.tensor(a, dtype=torch.float32) for a in (material.normal, reflectance))
+    # Residuals of about a tenth of the albedo are outliers until the lights are known.
+    return Vertices(normal, values, 0.1 * values[:, 0].clamp_min(1e-6))
+
+
+def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[torch.Tensor], one_rig: bool) -> list[torch.Tensor]:
+    """Per view m (lights, 3) in the camera's frame."""
+    sums = []
+    for samples, rotation in zip(views, rotations, strict=True):
+        n = vertices.normal[samples.vertex] @ rotation.T * vertices.reflectance[samples.vertex, :1]
+        weight = samples.weight[:, None] * samples.data * (samples.image > 0.2 * samples.image.quantile(0.9, dim=0))
+        sums.append((torch.einsum("pl,pi,pj->lij", weight, n, n), torch.einsum("pl,pl,pi->li", weight, samples.image, n)))
+    if one_rig:
+        sums = [(torch.stack([H for H, _ in sums]).sum(0), torch.stack([g for _, g in sums]).sum(0))] * len(sums)
+    eye = torch.eye(3)
+    return [torch.linalg.solve(H + 1e-6 * H.diagonal(dim1=1, dim2=2).mean() * eye, g[..., None])[..., 0] for H, g in sums]
+
+
+def _step(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: torch.Tensor, rotations: list[torch.Tensor], one_rig: bool
+) -> list[DirectionalLights]:
+    sums = []
+    for samples, of_view, rotation in zip(views, lights, rotations, strict=True):
+        count = len(of_view.intensity)
+        H, g = torch.zeros(count, 3, 3), torch.zeros(count, 3)
+        for part in samples.chunks():
+            index, towards = samples.vertex[part], samples.towards[part]
+            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, sharpness)
+            residual = shaded.predicted - samples.image[part]
+            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
+            J = light_jacobian(shaded, vertices.normal[index], towards, of_view, rotation)
+            H += torch.einsum("pl,pli,plj->lij", weight, J, J)
+            g += torch.einsum("pl,pli,pl->li", weight, J, residual)
+        sums.append((H, g))
+    if one_rig:
+        sums = [(torch.stack([H for H, _ in sums]).sum(0), torch.stack([g for _, g in sums]).sum(0))] * len(sums)
+    stepped = []
+    for (H, g), of_view, rotation in zip(sums, lights, rotations, strict=True):
+        H = H + torch.diag_embed(1e-4 * H.diagonal(dim1=1, dim2=2) + 1e-12)
+        m = (of_view.direction * of_view.intensity[:, None]) @ rotation.T - torch.linalg.solve(H, g[..., None])[..., 0]
+        stepped.append(_from_product(m, rotation))
+    return stepped
+
+
+def _from_product(m: torch.Tensor, rotation: torch.Tensor) -> DirectionalLights:
+    length = m.norm(dim=1).clamp_min(1e-12)
+    return DirectionalLights(m / length[:, None] @ rotation, length)
+
+
+def _as_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig: bool) -> Lights:
+    directions = [g.direction.double().numpy() for g in grey]
+    unit = tuple(d / np.linalg.norm(d, axis=1, keepdims=True) for d in directions)
+    return Lights(unit, tuple(g.intensity.double().numpy()[:, None] * r for g, r in zip(grey, ratios, strict=True)), one_rig)
+
+
+def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: bool) -> Lights:
+    """Lights of all photographs of `capture` for a known surface and material. one_rig: its views share them."""
+    torch.set_num_threads(1)
+    rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in capture.views]
+    sharpness = torch.tensor(material.sharpness, dtype=torch.float32)
+    # With the light at the camera no visible vertex is in shadow.
+    from_camera = [np.tile(-view.camera.rotation[2], (len(view.lights), 1)) for view in capture.views]
+    white = [np.ones_like(d) for d in from_camera]
+    views = observe(capture, surface, Lights(tuple(from_camera), tuple(white), one_rig), torch.device("cpu"))
+    vertices = _vertices(material)
+    products = _lambertian(views, vertices, rotations, one_rig)
+    grey = [_from_product(m, rotation) for m, rotation in zip(products, rotations, strict=True)]
+    for _ in range(2):
+        lights = _as_lights(grey, [channel_ratio(e) for e in white], one_rig)
+        views = observe(capture, surface, lights, torch.device("cpu"))
+        for _ in range(STEPS):
+            grey = _step(views, vertices, grey, sharpness, rotations, one_rig)
+    ratios = [channel_ratio(e) for e in white]
+    _, ratios = colours(capture, surface, views, vertices, grey, sharpness, ratios, one_rig)
+    return _as_lights(grey, ratios, one_rig)
+

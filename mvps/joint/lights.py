@@ -1,0 +1,198 @@
+"""The lights' block, solved together with the vertices it depends on.
+
+Alternating between lights and vertices creeps: a view's lights can grow only as fast as its vertices' albedo shrinks. So the vertices
+are eliminated. With unknowns m (all lights) and x_j (vertex j: normal, albedo, weights) the Gauss-Newton system
+
+    [ H_mm   H_mx ] [dm]     [g_m]                     S  = H_mm - sum_j H_mj (H_jj + P_j)^-1 H_jm
+    [ H_xm  H_xx+P] [dx] = - [g_x]      reduces to     S dm = -(g_m - sum_j H_mj (H_jj + P_j)^-1 g_j)
+
+(Schur complement, as in bundle adjustment: Triggs et al. 2000). P_j ties the vertex's normal to the mesh's normal: without it the lights
+slide along the generalised bas-relief family (Belhumeur et al. 1999) that no image can tell. What the model cannot explain (inter-
+reflection, other lobes) is shared by all samples of a vertex, so together they weigh as one: the tie with the mesh normal's standard
+deviation sigma is multiplied by the number of samples. It redescends beyond FAR_OFF, where the mesh is not yet the surface.
+Weights at their bound whose gradient keeps them there are no unknowns. A few thousand vertices say all there is to say about the lights,
+three unknowns each.
+
+float64 holds the reduced system: S is the small difference of two large matrices along the family.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_equations, vertex_jacobian
+from mvps.joint.observe import ViewSamples
+from solvers.least_squares import bounded_step
+
+VERTICES_PER_BLOCK = 256
+
+FAR_OFF = 0.05
+"""Radians between mesh and refined normal beyond which the mesh's normal is an outlier rather than noise."""
+
+LARGEST_TURN = 0.3
+"""Radians that a normal or light may turn in one step: the linearisation of n . l and of a lobe's flank ends there."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """The mesh's normals (V, 3), and their own standard deviation in radians."""
+
+    normal: Tensor
+    sigma: float
+
+
+def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen: Tensor) -> tuple[list[ViewSamples], Vertices, Anchor]:
+    """The same problem on the chosen vertices only."""
+    place = torch.full((len(vertices.normal),), -1, dtype=torch.long, device=chosen.device)
+    place[chosen] = torch.arange(len(chosen), device=chosen.device)
+    few = []
+    for s in views:
+        rows = torch.nonzero(place[s.vertex] >= 0)[:, 0]
+        few.append(ViewSamples(place[s.vertex[rows]], s.towards[rows], s.weight[rows], s.image[rows], s.data[rows]))
+    state = Vertices(vertices.normal[chosen], vertices.reflectance[chosen], vertices.scale[chosen])
+    return few, state, Anchor(anchor.normal[chosen], anchor.sigma)
+
+
+def tie(hessian: Tensor, gradient: Tensor, vertices: Vertices, anchor: Anchor) -> None:
+    """Adds the tie of the normals to the mesh, |t . (n - n_mesh)|^2 / sigma^2 in units of each vertex's residual variance, in place."""
+    strength = vertices.scale**2 / anchor.sigma**2
+    away = vertices.normal - anchor.normal
+    for k, tangent in enumerate(tangents(vertices.normal)):
+        hessian[:, k, k] += strength
+        gradient[:, k] += strength * (away * tangent).sum(1)
+
+
+def vertex_step(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor
+) -> Vertices:
+    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
+    equations = vertex_equations(views, vertices, lights, sharpness)
+    scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
+    scale = scale.clamp_min(0.1 * float(scale.median()))
+    vertices = replace(vertices, scale=scale)
+    tie(equations.hessian, equations.gradient, vertices, anchor)
+    lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
+    step = bounded_step(equations.hessian, equations.gradient, lower)
+    turn = step[:, :2]
+    turn = turn * (LARGEST_TURN / turn.norm(dim=1, keepdim=True).clamp_min(LARGEST_TURN))
+    first, second = tangents(vertices.normal)
+    normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
+    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), scale)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where the lights of each view stand among the unknowns: one place for all views of a rig, else one after the other."""
+
+    start: list[int]
+    total: int
+
+
+def _layout(lights: list[DirectionalLights], one_rig: bool) -> _Layout:
+    sizes = [len(of_view.intensity) for of_view in lights]
+    if one_rig:
+        return _Layout([0] * len(sizes), 3 * sizes[0])
+    starts = [3 * sum(sizes[:i]) for i in range(len(sizes))]
+    return _Layout(starts, 3 * sum(sizes))
+
+
+def _coupled(
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    sharpness: Tensor,
+    rotations: list[Tensor],
+    layout: _Layout,
+) -> tuple[Tensor, ...]:
+    """H_mm, g_m, H_jj, g_j, H_jm, each sample divided by its vertex's residual variance, and the weight of a vertex's samples (V,)."""
+    n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
+    lights_hessian, lights_gradient = (
+        like.new_zeros(layout.total, layout.total, dtype=torch.float64),
+        like.new_zeros(layout.total, dtype=torch.float64),
+    )
+    hessian, gradient = like.new_zeros(n, p, p), like.new_zeros(n, p)
+    cross, samples_of = like.new_zeros(n, p, layout.total), like.new_zeros(n)
+    frame = tangents(vertices.normal)
+    for samples, of_view, rotation, start in zip(views, lights, rotations, layout.start, strict=True):
+        width = 3 * len(of_view.intensity)
+        blocks = lights_hessian[start : start + width, start : start + width]
+        for part in samples.chunks():
+            index, towards = samples.vertex[part], samples.towards[part]
+            normal = vertices.normal[index]
+            shaded = evaluate(normal, vertices.reflectance[index], towards, of_view, sharpness)
+            residual = shaded.predicted - samples.image[part]
+            scale = vertices.scale[index]
+            weight = samples.weight[part, None] * samples.data[part] * robust(residual, scale) / scale[:, None] ** 2
+            of_vertex = vertex_jacobian(shaded, (frame[0][index], frame[1][index]), towards, of_view)
+            of_light = light_jacobian(shaded, normal, towards, of_view, rotation)
+            weighted = of_vertex * weight[:, None]
+            hessian.index_add_(0, index, weighted @ of_vertex.transpose(1, 2))
+            gradient.index_add_(0, index, (weighted @ residual[..., None])[..., 0])
+            samples_of.index_add_(0, index, (weight * scale[:, None] ** 2).sum(1))
+            coupling = (weighted[..., None] * of_light[:, None]).reshape(len(index), p, width)
+            cross[:, :, start : start + width].index_add_(0, index, coupling)
+            heavy = of_light * weight[..., None]
+            blocks += torch.block_diag(*torch.einsum("pli,plj->lij", heavy, of_light).double())
+            lights_gradient[start : start + width] += torch.einsum("pli,pl->li", heavy, residual).reshape(-1).double()
+    return lights_hessian, lights_gradient, hessian, gradient, cross, samples_of
+
+
+def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor) -> Tensor:
+    """dm of the Schur complement."""
+    H, g, hessian, gradient, cross, samples_of = parts
+    away = vertices.normal - anchor.normal
+    strength = samples_of * (1 + away.square().sum(1) / FAR_OFF**2) ** -2 / anchor.sigma**2
+    for k, tangent in enumerate(tangents(vertices.normal)):
+        hessian[:, k, k] += strength
+        gradient[:, k] += strength * (away * tangent).sum(1)
+    held = torch.zeros_like(gradient)
+    held[:, 2:] = ((vertices.reflectance <= 0) & (gradient[:, 2:] >= 0)).to(held.dtype)
+    free = 1 - held
+    hessian = hessian * free[:, :, None] * free[:, None, :] + torch.diag_embed(held)
+    hessian = hessian + torch.diag_embed(1e-6 * torch.diagonal(hessian, dim1=1, dim2=2) + 1e-12)
+    for start in range(0, len(hessian), VERTICES_PER_BLOCK):
+        part = slice(start, start + VERTICES_PER_BLOCK)
+        L = torch.linalg.cholesky(hessian[part].double())
+        coupled = (cross[part] * free[part][..., None]).double()
+        half = torch.linalg.solve_triangular(L, coupled, upper=False).reshape(-1, len(g))
+        right = torch.linalg.solve_triangular(L, (gradient[part] * free[part]).double()[..., None], upper=False).reshape(-1)
+        H -= half.T @ half
+        g -= half.T @ right
+    # The common scale of all lights is free (albedo takes it up): damping keeps it still.
+    diagonal = torch.diagonal(H).clamp_min(0)
+    H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max())
+    return -torch.linalg.solve(H, g)
+
+
+def light_step(
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    sharpness: Tensor,
+    anchor: Anchor,
+    rotations: list[Tensor],
+    one_rig: bool,
+) -> list[DirectionalLights]:
+    """One Gauss-Newton step of all lights with the vertices eliminated. rotations: camera_from_world of the views, float32."""
+    layout = _layout(lights, one_rig)
+    step = _reduced_step(_coupled(views, vertices, lights, sharpness, rotations, layout), vertices, anchor)
+    stepped = []
+    for of_view, rotation, start in zip(lights, rotations, layout.start, strict=True):
+        m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T
+        d = step[start : start + m.numel()].reshape(-1, 3)
+        length = m.norm(dim=1, keepdim=True)
+        d = d * (LARGEST_TURN * length / d.norm(dim=1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
+        m = m + d
+        intensity = m.norm(dim=1)
+        stepped.append(DirectionalLights((m / intensity[:, None] @ rotation.double()).float(), intensity.float()))
+    return stepped
+
+
+def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:
+    """The same images with the lights' mean intensity one."""
+    mean = float(torch.cat([of_view.intensity for of_view in lights]).mean())
+    scaled = [DirectionalLights(of_view.direction, of_view.intensity / mean) for of_view in lights]
+    return scaled, replace(vertices, reflectance=vertices.reflectance * mean)

@@ -1,0 +1,123 @@
+"""What the photographs say about the vertices of a mesh: one grey sample per (vertex, view, light).
+
+A vertex takes part in a view that sees it; its sample under light l is the bilinear value at its projection,
+
+    I_l = mean over channels of radiance_c / ratio_lc,     ratio = intensity over its mean over the channels,
+
+so that what is left of a light is one number, its mean intensity. Samples that are saturated or whose light another part of the mesh
+hides are no data. A pair (vertex, view) is weighted by cos^2 of the viewing angle (a pixel covers 1 / cos of the surface, and an error of
+the position moves the projection by as much again), times the part of its four pixels that is foreground at least one pixel away from the
+mask's boundary, where pixels mix object and background.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mvps.camera import bilinear, project, view_directions
+from mvps.mesh import mean_edge_length, vertex_normals
+from mvps.scene import Capture, Float, Int, Lights, Surface, View
+from mvps.visibility import RayCaster, cast_shadow, visible_vertices
+
+SAMPLES_PER_CHUNK = 1 << 15
+"""Samples handled at once: a float32 array of them takes 128 KB, so that the dozen of a chunk stay in a core's cache."""
+
+
+LIGHTEST_PAIR = 1e-3
+"""A pair of less weight (seen at over 88 degrees, or on a silhouette) is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSamples:
+    """One view's samples of the n vertices it sees. All in torch; directions in the world frame.
+
+    vertex (n,) index; towards (n, 3) unit vector to the camera; weight (n,) of the pair; image (n, lights) grey radiance;
+    data (n, lights) bool, False where saturated or in cast shadow.
+    """
+
+    vertex: Tensor
+    towards: Tensor
+    weight: Tensor
+    image: Tensor
+    data: Tensor
+
+    def chunks(self) -> Iterator[slice]:
+        """Slices of the pairs that hold about SAMPLES_PER_CHUNK samples."""
+        step = max(1, SAMPLES_PER_CHUNK // max(1, self.image.shape[1]))
+        return (slice(start, start + step) for start in range(0, len(self.vertex), step))
+
+
+def interior(view: View) -> NDArray[np.float32]:
+    """(pixels,) 1 where all eight neighbours of a foreground pixel are foreground, else 0."""
+    eroded = cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    inside: NDArray[np.float32] = eroded[view.mask].astype(np.float32)
+    return inside
+
+
+def channel_ratio(intensity: Float) -> Float:
+    """(lights, 3) intensity of the channels over their mean."""
+    ratio: Float = intensity / intensity.mean(1, keepdims=True)
+    return ratio
+
+
+def sample_grey(view: View, ratio: Float, positions: Int, weights: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Grey radiance (n, lights) at bilinear positions, weights (n, 4) of the foreground list, and whether all four are unsaturated."""
+    per_channel = (view.scale / (3 * ratio)).astype(np.float32)
+    image = np.empty((len(positions), len(view.lights)), np.float32)
+    usable = np.empty(image.shape, bool)
+    for start in range(0, len(positions), 4096):
+        part = slice(start, start + 4096)
+        corners = view.samples[positions[part]]
+        usable[part] = ((corners.max(-1) < view.saturation) | (weights[part, :, None] == 0)).all(1)
+        grey = np.einsum("pklc,lc->pkl", corners.astype(np.float32), per_channel)
+        image[part] = np.einsum("pkl,pk->pl", grey, weights[part])
+    return image, usable
+
+
+def _pairs(view: View, caster: RayCaster, normal: Float, offset: float) -> tuple[Int, Float, Float, Float]:
+    """Vertices (n,) that a view sees, with the weight of the pair (n,) and the bilinear positions and weights (n, 4)."""
+    vertex = np.flatnonzero(visible_vertices(caster, view.camera, normal, offset))
+    points = caster.surface.vertices[vertex]
+    positions, weights = bilinear(view.pixel_index, project(view.camera, points)[0])
+    pure = (interior(view)[positions] * weights).sum(1)
+    pair = pure * np.maximum((normal[vertex] * view_directions(view.camera, points)).sum(1), 0) ** 2
+    keep = pair > LIGHTEST_PAIR
+    return vertex[keep], pair[keep], positions[keep], weights[keep]
+
+
+def visible_in(capture: Capture, surface: Surface) -> list[tuple[Int, Float]]:
+    """Per view the vertices that it sees (n,) and the weight of each pair (n,)."""
+    caster, normal, offset = RayCaster(surface), vertex_normals(surface), mean_edge_length(surface)
+    return [_pairs(view, caster, normal, offset)[:2] for view in capture.views]
+
+
+def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device) -> list[ViewSamples]:
+    """The samples of all views on the vertices of `surface`; visibility and cast shadows are traced anew."""
+    caster, normal = RayCaster(surface), vertex_normals(surface)
+    offset = mean_edge_length(surface)
+
+    def one(i: int) -> ViewSamples:
+        view = capture.views[i]
+        vertex, pair, positions, weights = _pairs(view, caster, normal, offset)
+        towards = view_directions(view.camera, surface.vertices[vertex])
+        image, usable = sample_grey(view, channel_ratio(lights.intensity[i]), positions, weights)
+        shadow = cast_shadow(caster, vertex, normal, lights.direction[i], offset)
+        return ViewSamples(
+            torch.from_numpy(vertex).to(device),
+            torch.from_numpy(towards.astype(np.float32)).to(device),
+            torch.from_numpy(pair.astype(np.float32)).to(device),
+            torch.from_numpy(image).to(device),
+            torch.from_numpy(usable & ~shadow).to(device),
+        )
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(one, range(len(capture.views))))

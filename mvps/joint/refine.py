@@ -1,0 +1,336 @@
+"""Stage II: lights, normals, reflectance and vertices, in rounds on an ever finer mesh.
+
+A round:  remesh -> samples (visibility and shadows traced anew) -> vertices for fixed lights -> lights with the vertices eliminated
+-> vertices -> photometric stereo of the views under the new lights, if those moved -> agreement of views -> fused positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mvps.camera import bilinear, pixel_footprint, project
+from mvps.joint.blocks import DirectionalLights, Vertices, vertex_equations
+from mvps.joint.lights import Anchor, light_step, subset, vertex_step, with_mean_one
+from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in
+from mvps.joint.reflectance import colours
+from mvps.joint.vertices import Agreement, agreement, fuse
+from mvps.mesh import isotropic_remesh, normalise, vertex_normals
+from mvps.scene import Capture, Float, Lights, Material, NormalMap, Surface
+from solvers.least_squares import damped
+from solvers.low_rank import MAD_TO_SIGMA
+
+SHARPNESS = (8.0, 32.0, 128.0)
+"""Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
+
+NORMAL_SIGMA = 0.05
+"""Standard deviation of refined normals, radians, in the fusion with positions."""
+
+POSITION_FLOOR_PIXELS = 0.2
+"""Smallest standard deviation of an agreed position: neighbouring costs share their pixels, so their agreement looks better than it is."""
+
+COST_SMOOTHINGS = 2
+MATERIAL_STEPS = 3
+LIGHT_STEPS = 3
+WEAK_TIE = 0.3
+"""Standard deviation, radians, of refined normals from the mesh's in the vertices' own steps: it only speaks where samples do not."""
+
+LIGHTS_MOVED = 0.01
+"""Change of the lights, radians or relative intensity, from which the views' photometric stereo is done again."""
+
+STILL_DEG = 0.5
+"""Mean change of normals in a round below which they have settled: a tenth of the bar for good normals (5 deg)."""
+
+POOR_FIT = 0.1
+"""Relative residual above which the model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy objects."""
+
+PhotometricStereo = Callable[[Lights], tuple[NormalMap, ...]]
+
+
+@dataclass(frozen=True)
+class RoundSettings:
+    """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
+    lights and vertices' normals and reflectance, or only fuse the views' photometric stereo."""
+
+    edge: float
+    reach: float
+    step: float
+    photometric: bool = True
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """rounds: in order; light_vertices: vertices that stand for all when the lights are solved; free_lights: solve the lights."""
+
+    rounds: tuple[RoundSettings, ...]
+    light_vertices: int = 2000
+    free_lights: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """surface, material and lights; per round what changed; status in words and whether it is a good one."""
+
+    surface: Surface
+    material: Material
+    lights: Lights
+    rounds: list[dict[str, float]]
+    status: str
+    text: str
+
+
+@dataclass
+class _State:
+    """What one round hands to the next."""
+
+    surface: Surface
+    lights: Lights
+    maps: tuple[NormalMap, ...]
+    vertices: Vertices | None = None
+    views: list[ViewSamples] = field(default_factory=list)
+    maps_lights: Lights | None = None
+
+
+def _tensor(values: Any, device: torch.device) -> torch.Tensor:
+    return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+
+def grey_lights(lights: Lights, device: torch.device) -> list[DirectionalLights]:
+    """Directions and mean intensities as tensors."""
+    return [
+        DirectionalLights(_tensor(d, device), _tensor(e.mean(1), device)) for d, e in zip(lights.direction, lights.intensity, strict=True)
+    ]
+
+
+def coloured_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig: bool) -> Lights:
+    """Lights from directions, mean intensities and channel ratios (lights, 3)."""
+    directions = [normalise(of_view.direction.double().cpu().numpy()) for of_view in grey]
+    intensities = [of_view.intensity.double().cpu().numpy()[:, None] * r for of_view, r in zip(grey, ratios, strict=True)]
+    return Lights(tuple(directions), tuple(intensities), one_rig)
+
+
+def fused_maps(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Any]) -> tuple[Float, Float, Float]:
+    """Normal (V, 3), grey albedo (V,) and weight (V,) of the vertices from the views' photometric stereo; weight 0 where unseen."""
+    normal = np.zeros((len(surface.vertices), 3))
+    albedo, total = np.zeros(len(normal)), np.zeros(len(normal))
+    for view, photometric, (index, weight) in zip(capture.views, maps, seen, strict=True):
+        positions, corners = bilinear(view.pixel_index, project(view.camera, surface.vertices[index])[0])
+        w = corners * photometric.confidence[positions] * weight[:, None]
+        normal[index] += (photometric.normal[positions] * w[..., None]).sum(1)
+        albedo[index] += (photometric.albedo.mean(1)[positions] * w).sum(1)
+        total[index] += w.sum(1)
+    return normalise(normal), albedo / np.maximum(total, 1e-12), total
+
+
+def _started(state: _State, capture: Capture, anchor: NDArray[Any], carried: tuple[Surface, Vertices] | None, device: torch.device) -> Vertices:
+    """Vertices of the new mesh: from the nearest vertex of the last round's, or from the views' photometric stereo."""
+    if carried is not None:
+        nearest = torch.from_numpy(cKDTree(carried[0].vertices).query(state.surface.vertices)[1])
+        old = carried[1]
+        return Vertices(old.normal[nearest], old.reflectance[nearest], old.scale[nearest])
+    seen = [(s.vertex.cpu().numpy(), s.weight.cpu().numpy()) for s in state.views]
+    normal, albedo, total = fused_maps(capture, state.surface, state.maps, seen)
+    normal = np.where(total[:, None] > 0, normal, anchor)
+    reflectance = torch.zeros(len(normal), 1 + len(SHARPNESS), device=device)
+    reflectance[:, 0] = _tensor(albedo, device)
+    # No sample is an outlier before the first residuals are known.
+    return Vertices(_tensor(normal, device), reflectance, torch.full((len(normal),), float(np.median(albedo[total > 0])), device=device))
+
+
+def _solve_lights(
+    state: _State, vertices: Vertices, anchor: Anchor, capture: Capture, settings: RefineSettings, generator: np.random.Generator, device: torch.device
+) -> Lights:
+    """The lights solved on a random part of the vertices, which are solved along."""
+    seen = torch.zeros(len(vertices.normal), dtype=torch.bool, device=device)
+    for samples in state.views:
+        seen[samples.vertex] = True
+    candidates = torch.nonzero(seen)[:, 0].cpu().numpy()
+    chosen = np.sort(generator.permutation(candidates)[: settings.light_vertices])
+    few, part, tie = subset(state.views, vertices, anchor, torch.from_numpy(chosen).to(device))
+    sharpness = _tensor(SHARPNESS, device)
+    rotations = [_tensor(view.camera.rotation, device) for view in capture.views]
+    lights = grey_lights(state.lights, device)
+    for _ in range(LIGHT_STEPS):
+        lights = light_step(few, part, lights, sharpness, tie, rotations, state.lights.one_rig)
+        lights, part = with_mean_one(lights, part)
+        for _ in range(2):
+            part = vertex_step(few, part, lights, sharpness, tie)
+    return coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
+
+
+def _angle_deg(a: Any, b: Any) -> Float:
+    degrees: Float = np.degrees(np.arccos(np.clip((np.asarray(a) * np.asarray(b)).sum(-1), -1, 1)))
+    return degrees
+
+
+def light_change(a: Lights, b: Lights) -> tuple[float, float]:
+    """Mean change of directions (deg) and of intensities (relative)."""
+    turned = np.concatenate([_angle_deg(p, q) for p, q in zip(a.direction, b.direction, strict=True)])
+    before, after = np.concatenate(a.intensity), np.concatenate(b.intensity)
+    return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
+
+
+def _photometric_round(
+    state: _State,
+    capture: Capture,
+    settings: RefineSettings,
+    photometric_stereo: PhotometricStereo,
+    carried: tuple[Surface, Vertices] | None,
+    generator: np.random.Generator,
+    device: torch.device,
+) -> dict[str, float]:
+    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
+    state.views = observe(capture, state.surface, state.lights, device)
+    mesh_normal = vertex_normals(state.surface)
+    free = Anchor(_tensor(mesh_normal, device), WEAK_TIE)
+    sharpness = _tensor(SHARPNESS, device)
+    vertices = _started(state, capture, mesh_normal, carried, device)
+    before = vertices.normal
+    lights = grey_lights(state.lights, device)
+    for _ in range(MATERIAL_STEPS):
+        vertices = vertex_step(state.views, vertices, lights, sharpness, free)
+    moved = (0.0, 0.0)
+    if settings.free_lights:
+        deviation = np.median(np.linalg.norm(vertices.normal.cpu().numpy() - mesh_normal, axis=1))
+        tie = Anchor(free.normal, float(np.clip(MAD_TO_SIGMA * deviation, NORMAL_SIGMA / 5, NORMAL_SIGMA)))
+        solved = _solve_lights(state, vertices, tie, capture, settings, generator, device)
+        moved = light_change(state.lights, solved)
+        state.lights = solved
+        lights = grey_lights(solved, device)
+        for _ in range(2):
+            vertices = vertex_step(state.views, vertices, lights, sharpness, free)
+        turned, brighter = light_change(state.maps_lights or solved, solved)
+        if max(np.radians(turned), brighter) > LIGHTS_MOVED:
+            state.maps, state.maps_lights = photometric_stereo(solved), solved
+    state.vertices = vertices
+    seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
+    turned = _angle_deg(before.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen])
+    return {
+        "residual": relative_residual(state.views, vertices),
+        "light_change_deg": moved[0],
+        "intensity_change": moved[1],
+        "normal_change_deg": float(np.mean(turned)),
+    }
+
+
+def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
+    """Median over vertices of the residuals' standard deviation over the root mean square of the vertex's samples."""
+    square = torch.zeros_like(vertices.scale)
+    weight = torch.zeros_like(vertices.scale)
+    for samples in views:
+        for part in samples.chunks():
+            data = samples.data[part] * samples.weight[part, None]
+            square.index_add_(0, samples.vertex[part], (data * samples.image[part] ** 2).sum(1))
+            weight.index_add_(0, samples.vertex[part], data.sum(1))
+    seen = weight > 0
+    level = (square[seen] / weight[seen]).sqrt().clamp_min(1e-12)
+    return float((vertices.scale[seen] / level).median())
+
+
+def _moved(surface: Surface, normal: Float, state: _State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float) -> Surface:
+    offsets = np.arange(-settings.reach, settings.reach + settings.step / 2, settings.step) * pixel
+    agreed: Agreement = agreement(capture, surface, state.maps, seen, offsets, COST_SMOOTHINGS)
+    return fuse(surface, normal, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel)
+
+
+def refine(
+    capture: Capture,
+    surface: Surface,
+    lights: Lights,
+    maps: tuple[NormalMap, ...],
+    photometric_stereo: PhotometricStereo,
+    settings: RefineSettings,
+    seed: int,
+    device: str,
+    on_round: Callable[[int, dict[str, float]], None],
+) -> Refined:
+    """Stage II from a rough surface, lights and the views' photometric stereo under these lights.
+
+    photometric_stereo: does the latter again for other lights; on_round(number from 1, what changed) after each round.
+    """
+    generator = np.random.default_rng(seed)
+    on = torch.device(device)
+    torch.set_num_threads(1)
+    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    state = _State(surface, lights, maps, maps_lights=lights)
+    carried: tuple[Surface, Vertices] | None = None
+    account: list[dict[str, float]] = []
+    for number, round_settings in enumerate(settings.rounds, start=1):
+        state.surface = isotropic_remesh(state.surface, round_settings.edge * pixel)
+        mesh_normal = vertex_normals(state.surface)
+        if round_settings.photometric:
+            changes = _photometric_round(state, capture, settings, photometric_stereo, carried, generator, on)
+            assert state.vertices is not None
+            normal = normalise(state.vertices.normal.double().cpu().numpy())
+            seen = [s.vertex.cpu().numpy() for s in state.views]
+        else:
+            pairs = visible_in(capture, state.surface)
+            fused, _, total = fused_maps(capture, state.surface, state.maps, pairs)
+            normal = np.where(total[:, None] > 0, fused, mesh_normal)
+            seen, changes = [index for index, _ in pairs], {}
+        moved = _moved(state.surface, normal, state, capture, seen, round_settings, pixel)
+        shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
+        changes["vertex_change_px"] = float(shift.mean() / pixel)
+        state.surface = moved
+        if state.vertices is not None:
+            carried = (moved, state.vertices)
+        account.append({"round": float(number), "vertices": float(len(shift)), **changes})
+        on_round(number, account[-1])
+    return _finished(state, capture, account, on)
+
+
+def _finished(state: _State, capture: Capture, account: list[dict[str, float]], device: torch.device) -> Refined:
+    assert state.vertices is not None
+    sharpness = _tensor(SHARPNESS, device)
+    ratios = [channel_ratio(e) for e in state.lights.intensity]
+    grey = grey_lights(state.lights, device)
+    albedo, ratios = colours(capture, state.surface, state.views, state.vertices, grey, sharpness, ratios, state.lights.one_rig)
+    lights = coloured_lights(grey, ratios, state.lights.one_rig)
+    material = _material(state, albedo, grey, sharpness)
+    status, text = _verdict(account)
+    return Refined(state.surface, material, lights, account, status, text)
+
+
+def _material(state: _State, albedo: Float, lights: list[DirectionalLights], sharpness: torch.Tensor) -> Material:
+    """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
+    assert state.vertices is not None
+    vertices, known = state.vertices, np.isfinite(albedo).all(1)
+    equations = vertex_equations(state.views, vertices, lights, sharpness)
+    count = equations.count.cpu().numpy()
+    # The samples of a vertex share the model's error: their number does not reduce it, so the covariance is taken per sample.
+    inverse = torch.linalg.inv(damped(equations.hessian, 1e-3).double().cpu())
+    variance = inverse[:, 0, 0] + inverse[:, 1, 1]
+    sigma = np.sqrt(np.maximum(variance.numpy() / 2, 0)) * vertices.scale.cpu().numpy() * np.sqrt(np.maximum(count, 1))
+    nearest = np.arange(len(albedo))
+    nearest[~known] = np.flatnonzero(known)[cKDTree(state.surface.vertices[known]).query(state.surface.vertices[~known])[1]]
+    normal = normalise(vertices.normal.double().cpu().numpy())
+    normal[~known] = vertex_normals(state.surface)[~known]
+    weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
+    confidence = np.where(known, 1 / (1 + (sigma / NORMAL_SIGMA) ** 2), 0)
+    return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.nan_to_num(confidence))
+
+
+def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:
+    """Status and a sentence, from residual and last change alone."""
+    last = account[-1]
+    if last["residual"] > POOR_FIT:
+        return "poor fit", (
+            f"The model fits badly: it leaves {100 * last['residual']:.0f} % of the images' signal unexplained (good fits leave under"
+            f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks or poses."
+        )
+    if last["normal_change_deg"] > STILL_DEG:
+        return "not settled", (
+            f"Normals still changed by {last['normal_change_deg']:.2f} deg in the last round (settled below {STILL_DEG} deg);"
+            " a finer preset does more rounds."
+        )
+    return "converged", (
+        f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last round normals changed by"
+        f" {last['normal_change_deg']:.2f} deg, lights by {last['light_change_deg']:.2f} deg, vertices by {last['vertex_change_px']:.2f} px."
+    )

@@ -1,0 +1,137 @@
+"""Ground truth of a capture in the layout of DiLiGenT-MV: read only where the user asks for it.
+
+CAPTURE/view_01/Normal_gt.mat           Normal_gt (height, width, 3), DiLiGenT camera frame
+CAPTURE/view_01/light_directions.txt    a unit vector per light, DiLiGenT camera frame
+CAPTURE/view_01/light_intensities.txt   red, green, blue per light
+CAPTURE/mesh_Gt.ply                     world frame and units
+
+x_world = rotation^T DILIGENT_FROM_CAMERA^T x_diligent
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.load.calibration import Calibration, read_calibration, read_mat
+from mvps.load.diligent import view_folders
+from mvps.load.images import complaint, read_bytes, read_mask
+from mvps.scene import Capture, Float, Lights, Surface, Truth
+
+ONE_RIG_TOLERANCE = 1e-3
+"""Radians between two views' light directions that still count as the same: the files print 4 digits or more."""
+
+
+def read_truth(path: str | Path) -> Truth:
+    """The ground truth that lies in a capture's folder; what is absent there is absent in the result.
+
+    Raises CaptureError about files that are there and wrong.
+    """
+    root = Path(path)
+    calibration = read_calibration(root)
+    present = [int(f.name[5:]) for f in root.glob("view_*") if f.is_dir() and f.name[5:].isdigit()]
+    folders = view_folders(root, calibration, [n for n in present if n in calibration.rotation] or None)
+    normals, direction, intensity = {}, {}, {}
+    for number, folder in folders.items():
+        world_from_diligent = _world_from_diligent(calibration, number)
+        if (folder / "Normal_gt.mat").exists():
+            normals[folder.name] = _normals(folder, world_from_diligent)
+        if (folder / "light_directions.txt").exists():
+            direction[folder.name] = _directions(folder) @ world_from_diligent.T
+        if (folder / "light_intensities.txt").exists():
+            intensity[folder.name] = _table(folder / "light_intensities.txt", positive=True)
+    mesh = root / "mesh_Gt.ply"
+    return Truth(
+        views=tuple(folder.name for folder in folders.values()),
+        normals=normals,
+        direction=direction,
+        intensity=intensity,
+        surface=_surface(mesh) if mesh.exists() else None,
+    )
+
+
+def read_calibrated_lights(path: str | Path, capture: Capture) -> Lights:
+    """The lights given with a capture, for the views and lights that `capture` holds, matched by their numbers.
+
+    Directions in the world frame; intensities divided by their mean over all lights and channels. CaptureError where a
+    file or a light is missing.
+    """
+    root = Path(path)
+    calibration = read_calibration(root)
+    directions, intensities, in_camera = [], [], []
+    for view in capture.views:
+        folder = root / view.name
+        tables = _directions(folder), _table(folder / "light_intensities.txt", positive=True)
+        for name, table in zip(("light_directions.txt", "light_intensities.txt"), tables, strict=True):
+            if len(table) < max(view.lights):
+                wanted = f"a line for each of {max(view.lights)} lights"
+                raise complaint(folder / name, wanted, f"{len(table)} lines", "add the missing lights")
+        rows = np.array(view.lights) - 1
+        in_camera.append(tables[0][rows])
+        directions.append(in_camera[-1] @ _world_from_diligent(calibration, int(view.name[5:])).T)
+        intensities.append(tables[1][rows])
+    mean = np.concatenate(intensities).mean()
+    # The chord of an angle this small is the angle.
+    one_rig = all(
+        view.lights == capture.views[0].lights and np.linalg.norm(local - in_camera[0], axis=-1).max() <= ONE_RIG_TOLERANCE
+        for view, local in zip(capture.views, in_camera, strict=True)
+    )
+    return Lights(tuple(directions), tuple(table / mean for table in intensities), one_rig)
+
+
+def _world_from_diligent(calibration: Calibration, number: int) -> Float:
+    world_from_diligent: Float = calibration.rotation[number].T @ DILIGENT_FROM_CAMERA.T
+    return world_from_diligent
+
+
+def _normals(folder: Path, world_from_diligent: Float) -> NDArray[np.float32]:
+    path = folder / "Normal_gt.mat"
+    mask = read_mask(folder / "mask.png")
+    local = np.asarray(read_mat(path, ["Normal_gt"])["Normal_gt"])
+    if local.shape != (*mask.shape, 3) or local.dtype.kind not in "fiu":
+        wanted = f"Normal_gt of shape {(*mask.shape, 3)} as in mask.png"
+        raise complaint(path, wanted, f"{local.dtype} of shape {local.shape}", "export it again")
+    world = local.astype(np.float64) @ world_from_diligent.T
+    length = np.linalg.norm(world, axis=-1, keepdims=True)
+    world = np.divide(world, length, out=np.full_like(world, np.nan), where=length > 0)
+    world[~mask] = np.nan
+    return np.asarray(world, np.float32)
+
+
+def _directions(folder: Path) -> Float:
+    """(lights, 3) unit, DiLiGenT camera frame."""
+    path = folder / "light_directions.txt"
+    table = _table(path, positive=False)
+    length = np.linalg.norm(table, axis=-1, keepdims=True)
+    # Rounding to the 2 digits that any file prints moves a unit vector's length by less than this.
+    if np.abs(length - 1).max() > 0.02:
+        line = int(np.abs(length - 1).argmax()) + 1
+        raise complaint(path, "unit vectors", f"one of length {length[line - 1, 0]:.4g} in line {line}", "normalise the directions")
+    unit: Float = table / length
+    return unit
+
+
+def _table(path: Path, positive: bool) -> Float:
+    """(lights, 3) finite numbers."""
+    text = read_bytes(path, "three numbers per light", "provide the file, or leave the calibrated lights out")
+    try:
+        table = np.array([[float(word) for word in line.split()] for line in text.decode().splitlines() if line.strip()])
+    except ValueError as error:
+        raise complaint(path, "three numbers per line", f"text that is none ({error})", "correct the file") from None
+    if table.ndim != 2 or table.shape[1] != 3 or not np.isfinite(table).all() or (positive and (table <= 0).any()):
+        wanted = "three finite " + ("positive " if positive else "") + "numbers per line"
+        raise complaint(path, wanted, f"a table of shape {table.shape}, smallest {table.min(initial=np.inf):.4g}", "correct the file")
+    return table
+
+
+def _surface(path: Path) -> Surface:
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    except (ValueError, IndexError, KeyError, AttributeError, TypeError, EOFError) as error:
+        raise complaint(path, "a triangle mesh as PLY", f"one that cannot be read ({error})", "copy or export it again") from None

@@ -1,0 +1,255 @@
+"""How far a reconstruction is from the truth, and from photographs it has not seen.
+
+First hits       p_i of the rays through the mask's pixel centres of all views, on the result and on the truth: every part of
+                 the surface counts as often as it was photographed, and what no camera saw does not count.
+Distance         d(p, S) = min over the triangles of S of |p - q|, exact; accuracy = mean d(p_result, truth), completeness =
+                 mean d(p_truth, result), Chamfer = (accuracy + completeness) / 2, not squared. Figures called _mm are in
+                 the capture's own unit, millimetres by convention; _px are divided by what a pixel covers at the object.
+F-score          harmonic mean of the shares of both point sets that are nearer than a threshold (Knapitsch et al. 2017).
+Signed offset    mean of +-d(p_result, truth), negative inside: the sign of (p - q) . normal(q).
+Normals          angle(a, b) = 2 atan2(|a - b|, |a + b|) (Kahan), exact for small angles too.
+Lights           one scale for all lights and channels, s = (e . t) / (e . e); error = mean |s e - t| / t (Chen et al. 2019, eq. 8).
+Photographs      PSNR = mean over images of 10 log10(peak^2 / mean squared error) inside the mask; peak is the radiance at which
+                 the camera clips, the rendering is clipped there too; one scale for all images by least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import igl
+import numpy as np
+
+from mvps.camera import pixel_footprint
+from mvps.mesh import mean_edge_length, normalise, vertex_normals
+from mvps.scene import Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
+from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
+
+F_SCORE_THRESHOLDS = (0.5, 1.0)
+"""Units of the capture (mm): the two thresholds usual for objects the size of a hand."""
+
+Photograph = tuple[str, int]
+"""A photograph: the name of its view and the number of its light, counted from 1."""
+
+Light = tuple[Float, Float]
+"""Direction (3,), unit, world frame, and RGB intensity (3,)."""
+
+
+def angles_deg(a: Float, b: Float) -> Float:
+    """Angles (...,) in degrees between unit vectors a and b (..., 3)."""
+    chord, sum_ = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
+    angle: Float = np.degrees(2 * np.arctan2(chord, sum_))
+    return angle
+
+
+def first_hit_points(surface: Surface, capture: Capture) -> Float:
+    """(n, 3) world points where the rays through the mask's pixels of all views first meet the surface."""
+    caster = RayCaster(surface)
+    points = []
+    for view in capture.views:
+        hits = camera_hits(caster, view.camera, view.pixels)
+        points.append(interpolate(surface, hits, surface.vertices)[hits.face >= 0])
+    return np.concatenate(points)
+
+
+def distance_to(points: Float, surface: Surface) -> tuple[Float, Float]:
+    """Distance (n,) of points (n, 3) to the nearest point of the surface, and the same with a sign, negative inside."""
+    vertices, faces = np.array(surface.vertices), np.array(surface.faces)
+    squared, face, nearest = igl.point_mesh_squared_distance(np.ascontiguousarray(points), vertices, faces)
+    distance = np.sqrt(squared)
+    # The normal interpolated from the vertices tells inside from outside on edges and corners too, where a face's does not.
+    corners = vertices[faces[face]]
+    barycentric = np.nan_to_num(igl.barycentric_coordinates(nearest, *(np.ascontiguousarray(corners[:, k]) for k in range(3))))
+    normal = interpolate(surface, Hits(face, np.clip(barycentric, 0, 1), distance), vertex_normals(surface))
+    inside = ((points - nearest) * normal).sum(-1) < 0
+    return distance, np.where(inside, -distance, distance)
+
+
+def object_centre(surface: Surface) -> Float:
+    """(3,) centre of the bounding box."""
+    centre: Float = (surface.vertices.min(0) + surface.vertices.max(0)) / 2
+    return centre
+
+
+def surface_errors(surface: Surface, truth: Surface, capture: Capture) -> dict[str, float]:
+    """Accuracy, completeness and Chamfer distance (units of the capture and pixels), F-scores and signed offset.
+
+    Only the cameras and masks of the capture are used. ValueError where no ray meets one of the two surfaces.
+    """
+    result_points, truth_points = first_hit_points(surface, capture), first_hit_points(truth, capture)
+    for name, points in (("result", result_points), ("truth", truth_points)):
+        if not len(points):
+            raise ValueError(f"{name} mesh: wanted a surface in front of the capture's cameras, given one that no mask's pixel sees")
+    to_truth, signed = distance_to(result_points, truth)
+    to_result, _ = distance_to(truth_points, surface)
+    pixel = pixel_footprint([view.camera for view in capture.views], object_centre(truth))
+    accuracy, completeness = float(to_truth.mean()), float(to_result.mean())
+    distances = {"accuracy": accuracy, "completeness": completeness, "chamfer": (accuracy + completeness) / 2}
+    errors = {f"{name}_mm": value for name, value in distances.items()}
+    errors |= {f"{name}_px": value / pixel for name, value in distances.items()}
+    errors |= {"offset_px": float(signed.mean()) / pixel, "pixel_mm": pixel}
+    errors["mesh_coverage"] = len(result_points) / sum(int(view.mask.sum()) for view in capture.views)
+    for threshold in F_SCORE_THRESHOLDS:
+        precision, recall = float((to_truth < threshold).mean()), float((to_result < threshold).mean())
+        f_score = 2 * precision * recall / max(precision + recall, np.finfo(float).tiny)
+        errors[f"f_score_{threshold:g}_mm".replace(".", "_")] = f_score
+    return errors
+
+
+def mesh_normals(caster: RayCaster, view: View) -> Float:
+    """(height, width, 3) vertex normals interpolated at the first hits of the mask's pixels, world frame, NaN elsewhere."""
+    surface = caster.surface
+    hits = camera_hits(caster, view.camera, view.pixels)
+    normal = normalise(interpolate(surface, hits, vertex_normals(surface)))
+    normal[hits.face < 0] = np.nan
+    image = np.full((*view.mask.shape, 3), np.nan)
+    image[view.mask] = normal
+    return image
+
+
+def normal_errors(
+    estimated: Mapping[str, Float], truth: Mapping[str, Float], capture: Capture, held_out: Collection[str] = ()
+) -> dict[str, float]:
+    """Mean and median angle in degrees, and the share of the pixels that have an estimate at all.
+
+    estimated, truth: view name -> (height, width, 3) unit, world frame, NaN outside the mask. Over all pixels of all views
+    inside the capture's mask and both maps; where views are held out also over these alone (held_out_...) and over the others
+    (fitted_...). Views without truth are left out; no truth at all gives no figures.
+    """
+    groups: dict[str, list[Any]] = {"": [], "fitted_": [], "held_out_": []}
+    known: dict[str, list[Any]] = {name: [] for name in groups}
+    for view in capture.views:
+        if view.name not in truth:
+            continue
+        wanted = view.mask & np.isfinite(truth[view.name]).all(-1)
+        given = np.asarray(estimated.get(view.name, np.full((*view.mask.shape, 3), np.nan)), np.float64)
+        both = wanted & np.isfinite(given).all(-1)
+        angle = angles_deg(given[both], truth[view.name][both])
+        for group in ("", "held_out_" if view.name in held_out else "fitted_"):
+            groups[group].append(angle)
+            known[group].append(wanted.sum())
+    if not held_out:
+        del groups["fitted_"]
+    errors: dict[str, float] = {}
+    for group, parts in groups.items():
+        angles = np.concatenate(parts) if parts else np.zeros(0)
+        if len(angles):
+            errors[f"{group}normal_error_deg"] = float(angles.mean())
+            errors[f"{group}normal_error_median_deg"] = float(np.median(angles))
+        if parts:
+            errors[f"{group}normal_coverage"] = len(angles) / max(1, int(sum(known[group])))
+    return errors
+
+
+def mesh_normal_errors(surface: Surface, truth: Mapping[str, Float], capture: Capture, held_out: Collection[str] = ()) -> dict[str, float]:
+    """`normal_errors` of the mesh's own normals at the first hits of the mask's pixels."""
+    caster = RayCaster(surface)
+    estimated = {view.name: mesh_normals(caster, view) for view in capture.views if view.name in truth}
+    return normal_errors(estimated, truth, capture, held_out)
+
+
+def by_photograph(lights: Lights, views: Sequence[str], numbers: Sequence[Sequence[int]]) -> dict[Photograph, Light]:
+    """The lights of `views`, by the photograph they lit; numbers: per view those of its lights, in the order of `lights`."""
+    return {
+        (view, number): (lights.direction[i][k], lights.intensity[i][k])
+        for i, view in enumerate(views)
+        for k, number in enumerate(numbers[i])
+    }
+
+
+def true_lights(truth: Truth) -> dict[Photograph, Light]:
+    """The true lights, by the photograph they lit, of the views whose directions and intensities are both known."""
+    return {
+        (view, k + 1): light
+        for view in truth.views
+        if view in truth.direction and view in truth.intensity
+        for k, light in enumerate(zip(truth.direction[view], truth.intensity[view], strict=True))
+    }
+
+
+def light_errors(estimated: Mapping[Photograph, Light], truth: Mapping[Photograph, Light]) -> dict[str, float]:
+    """Mean and largest angle in degrees and relative intensity error, over all photographs that both know.
+
+    Directions are in the world frame; intensities are compared up to one scale for all. No common photograph gives no figures.
+    """
+    common = [photograph for photograph in estimated if photograph in truth]
+    if not common:
+        return {}
+    direction, intensity = (np.stack(rows) for rows in zip(*(estimated[photograph] for photograph in common), strict=True))
+    true_direction, true_intensity = (np.stack(rows) for rows in zip(*(truth[photograph] for photograph in common), strict=True))
+    angle = angles_deg(direction, true_direction)
+    scale = float((intensity * true_intensity).sum() / (intensity**2).sum())
+    relative = np.abs(scale * intensity - true_intensity) / true_intensity
+    return {
+        "light_error_deg": float(angle.mean()),
+        "light_error_max_deg": float(angle.max()),
+        "intensity_error": float(relative.mean()),
+    }
+
+
+def photograph_errors(
+    surface: Surface, material: Material, lights: Mapping[Photograph, Light], capture: Capture, held_out_views: Collection[str] = ()
+) -> dict[str, float]:
+    """PSNR in dB of re-rendered photographs that were held out, separately for held-out views and for held-out lights.
+
+    lights: photograph -> its light as reconstructed, for the held-out photographs only. Those in `held_out_views` count as
+    held-out views, the others as held-out lights. Photographs that the capture lacks are left out. One scale serves all of
+    them and is reported as photograph_scale: intensities are relative, so it need not be 1.
+    """
+    from mvps.rendering import photograph
+
+    caster, offset = RayCaster(surface), mean_edge_length(surface)
+    pairs: list[tuple[View, Any, Any, Any]] = []
+    for view in capture.views:
+        kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]
+        if kept:
+            direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
+            rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset)
+            pairs.append((view, rendered, view.radiance(kept), view.usable(kept)))
+    if not pairs:
+        return {}
+    # Clipped samples say nothing about the scale.
+    products = [(float(r[u].ravel() @ p[u].ravel()), float(r[u].ravel() @ r[u].ravel())) for _, r, p, u in pairs]
+    scale = sum(a for a, _ in products) / max(sum(b for _, b in products), np.finfo(float).tiny)
+    psnr: dict[str, list[float]] = {"held_out_views_psnr_db": [], "held_out_lights_psnr_db": []}
+    for view, rendered, photographed, _ in pairs:
+        # Below the variance of rounding to a code value nothing can be told apart.
+        peak = view.scale * view.saturation
+        mean_square = ((np.minimum(scale * rendered, peak) - np.minimum(photographed, peak)) ** 2).mean((0, 2), dtype=np.float64)
+        group = "held_out_views_psnr_db" if view.name in held_out_views else "held_out_lights_psnr_db"
+        psnr[group] += (10 * np.log10(peak**2 / np.maximum(mean_square, view.scale**2 / 12))).tolist()
+    return {name: float(np.mean(values)) for name, values in psnr.items() if values} | {"photograph_scale": scale}
+
+
+def held_out_views(reconstruction: Reconstruction) -> tuple[str, ...]:
+    """Names of the views in the result that were held out (settings: hold_out_views, numbers counted from 1)."""
+    numbers = reconstruction.settings.get("hold_out_views") or []
+    return tuple(view for view in reconstruction.views if int(view.rpartition("_")[2]) in numbers)
+
+
+def held_out_photographs(reconstruction: Reconstruction) -> dict[Photograph, Light]:
+    """All photographs of held-out views and those of held-out lights (settings: hold_out_lights) in the others, with their lights."""
+    views, numbers = held_out_views(reconstruction), reconstruction.settings.get("hold_out_lights") or []
+    lights = by_photograph(reconstruction.lights, reconstruction.views, reconstruction.light_names)
+    return {(view, number): light for (view, number), light in lights.items() if view in views or number in numbers}
+
+
+def evaluate(reconstruction: Reconstruction, capture: Capture, truth: Truth) -> dict[str, float]:
+    """All measures of this file under the names of the report; what cannot be said is left out.
+
+    capture: cameras and masks of the views to look from, and the photographs that were held out (others are not looked at).
+    Views that the result was not reconstructed from, held out or not in it at all, count as held out for the normals.
+    mesh_... are the mesh's own normals, map_... the refined normal maps.
+    """
+    held_out = held_out_views(reconstruction)
+    unseen = {view.name for view in capture.views if view.name in held_out or view.name not in reconstruction.views}
+    errors = surface_errors(reconstruction.surface, truth.surface, capture) if truth.surface is not None else {}
+    maps = dict(zip(reconstruction.views, reconstruction.normal_maps, strict=True))
+    mapped = Capture(capture.name, tuple(view for view in capture.views if view.name in maps))
+    errors |= {f"mesh_{k}": v for k, v in mesh_normal_errors(reconstruction.surface, truth.normals, capture, unseen).items()}
+    errors |= {f"map_{k}": v for k, v in normal_errors(maps, truth.normals, mapped, unseen & set(maps)).items()}
+    lights = by_photograph(reconstruction.lights, reconstruction.views, reconstruction.light_names)
+    errors |= light_errors(lights, true_lights(truth))
+    held_out_lights = held_out_photographs(reconstruction)
+    return errors | photograph_errors(reconstruction.surface, reconstruction.material, held_out_lights, capture, held_out)

@@ -1,0 +1,121 @@
+"""Discrete geometry on a triangle mesh (V, F): normals, Laplacian, mass matrix, remeshing, cleaning.
+
+cotangent Laplacian   L_ij = -(cot a_ij + cot b_ij) / 2, rows sum to 0, positive semidefinite (igl.cotmatrix is -L)
+mass matrix           M_ii = a third of the area of the faces around vertex i (barycentric), trace = surface area
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import igl
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
+
+from mvps.scene import Float, Int, Surface
+
+
+def face_cross(surface: Surface) -> Float:
+    """(F, 3) cross product of two edges of every face: outward normal times twice the area."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    cross: Float = np.cross(b - a, c - a)
+    return cross
+
+
+def normalise(vectors: Float, floor: float = 1e-300) -> Float:
+    """Vectors (..., 3) divided by their length; a zero vector stays zero."""
+    unit: Float = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), floor)
+    return unit
+
+
+def face_normals(surface: Surface) -> Float:
+    """(F, 3) unit outward normals; zero for a degenerate face."""
+    return normalise(face_cross(surface))
+
+
+def face_areas(surface: Surface) -> Float:
+    """(F,) areas."""
+    areas: Float = np.linalg.norm(face_cross(surface), axis=-1) / 2
+    return areas
+
+
+def vertex_normals(surface: Surface) -> Float:
+    """(V, 3) unit outward normals: face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998)."""
+    corners = surface.vertices[surface.faces]
+    normals = face_normals(surface)
+    total = np.zeros_like(surface.vertices)
+    for k in range(3):
+        u = normalise(corners[:, (k + 1) % 3] - corners[:, k])
+        v = normalise(corners[:, (k + 2) % 3] - corners[:, k])
+        angle = np.arccos(np.clip((u * v).sum(-1), -1, 1))
+        for axis in range(3):
+            total[:, axis] += np.bincount(surface.faces[:, k], angle * normals[:, axis], len(total))
+    flat = np.linalg.norm(total, axis=-1) < 1e-12
+    total[flat] = (0, 0, 1)
+    return normalise(total)
+
+
+def cotangent_laplacian(surface: Surface) -> sp.csc_matrix:
+    """(V, V) positive semidefinite cotangent Laplacian."""
+    return sp.csc_matrix(-igl.cotmatrix(np.ascontiguousarray(surface.vertices), np.ascontiguousarray(surface.faces)))
+
+
+def mass_matrix(surface: Surface) -> sp.csc_matrix:
+    """(V, V) diagonal of vertex areas."""
+    return sp.csc_matrix(
+        igl.massmatrix(np.ascontiguousarray(surface.vertices), np.ascontiguousarray(surface.faces), igl.MASSMATRIX_TYPE_BARYCENTRIC)
+    )
+
+
+def edges(surface: Surface) -> Int:
+    """(E, 2) undirected edges, the smaller index first, each once."""
+    halves = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    unique: Int = np.unique(halves, axis=0)
+    return unique
+
+
+def mean_edge_length(surface: Surface) -> float:
+    """Mean length of the edges."""
+    ends = surface.vertices[edges(surface)]
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean())
+
+
+def is_closed(surface: Surface) -> bool:
+    """True where every edge has exactly two faces."""
+    halves = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    _, count = np.unique(halves, axis=0, return_counts=True)
+    return bool((count == 2).all())
+
+
+def signed_volume(surface: Surface) -> float:
+    """Volume of a closed mesh, positive where the faces point outwards."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def without_unused_vertices(surface: Surface) -> Surface:
+    """The same faces over only the vertices that they use."""
+    used, inverse = np.unique(surface.faces, return_inverse=True)
+    return Surface(surface.vertices[used], inverse.reshape(-1, 3))
+
+
+def largest_component(surface: Surface) -> Surface:
+    """The connected component with the largest area."""
+    n = len(surface.vertices)
+    pairs = edges(surface)
+    graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    area = np.bincount(label[surface.faces[:, 0]], face_areas(surface))
+    return without_unused_vertices(Surface(surface.vertices, surface.faces[label[surface.faces[:, 0]] == area.argmax()]))
+
+
+def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 3) -> Surface:
+    """The surface with edges of about `edge_length` (split, collapse, flip, relax: Botsch and Kobbelt 2004)."""
+    from gpytoolbox import remesh_botsch
+
+    vertices: Any
+    vertices, faces = remesh_botsch(
+        np.array(surface.vertices), np.array(surface.faces, dtype=np.int32), i=iterations, h=edge_length, project=True
+    )
+    return largest_component(Surface(vertices, faces))

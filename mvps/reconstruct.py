@@ -1,0 +1,292 @@
+"""The pipeline, photographs in, textured mesh out, and its command line.
+
+    capture -> visual hull -> lights -> photometric stereo of every view -> Stage I: occupancy field -> Stage II: everything together
+            -> lights of held-out photographs, normal maps -> textures, report, result folder
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mvps import __version__
+from mvps.command import lights_argument, number_list, parse, parser, run
+from mvps.progress import Progress
+from mvps.scene import Capture, CaptureError, Lights, NormalMap, Reconstruction
+
+if TYPE_CHECKING:
+    from mvps.joint.refine import Refined, RefineSettings
+    from mvps.scene import SignedDistanceGrid, Surface
+
+PRESETS = ("draft", "standard", "fine")
+
+Numbers = Sequence[int]
+LightNumbers = Numbers | Mapping[str, Numbers]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything needed to run a reconstruction again.
+
+    views, lights: numbers to use, counted from 1, empty for all; hold_out_views, hold_out_lights: numbers kept back for evaluation.
+    """
+
+    capture: str
+    preset: str = "standard"
+    views: Numbers = ()
+    lights: LightNumbers = ()
+    hold_out_views: Numbers = ()
+    hold_out_lights: Numbers = ()
+    calibrated_lights: bool = False
+    device: str = "auto"
+    seed: int = 0
+
+
+def refine_settings(preset: str, free_lights: bool) -> RefineSettings:
+    """The rounds of Stage II. A sweep reaches as far as the last round may have left the surface off: first what a hull bulges."""
+    from mvps.joint.refine import RefineSettings, RoundSettings
+
+    rough = (RoundSettings(2.0, 4.0, 0.5, photometric=False), RoundSettings(2.0, 3.0, 0.5, photometric=False))
+    rounds = {
+        "draft": (*rough, RoundSettings(1.5, 2.0, 0.4)),
+        "standard": (*rough, RoundSettings(1.5, 2.0, 0.4), RoundSettings(1.0, 1.2, 0.3), RoundSettings(1.0, 1.2, 0.3)),
+        "fine": (*rough, *(RoundSettings(edge, 1.5 * edge, 0.3 * edge) for edge in (1.5, 1.0, 1.0, 0.75, 0.75))),
+    }
+    return RefineSettings(rounds[preset], free_lights=free_lights)
+
+
+def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
+    """What is reconstructed from, and the same views with the lights that were kept back plus the views that were, all their lights
+    (None where nothing is).
+
+    CaptureError where nothing would be left to reconstruct from.
+    """
+    keep: dict[str, list[int]] = {}
+    back: dict[str, list[int]] = {}
+    for view in capture.views:
+        held = int(view.name[5:]) in hold_out_views
+        keep[view.name] = [] if held else [n for n in view.lights if n not in hold_out_lights]
+        back[view.name] = list(view.lights) if held else [n for n in view.lights if n in hold_out_lights]
+    if not any(keep.values()):
+        raise CaptureError(f"{capture.name}: wanted photographs left after holding some out, given none; hold out fewer views or lights")
+    used = capture.select({name: numbers for name, numbers in keep.items() if numbers})
+    rest = {name: numbers for name, numbers in back.items() if numbers}
+    return used, capture.select(rest) if rest else None
+
+
+def chosen_device(device: str) -> str:
+    """"cpu" or "cuda" for auto, cpu or cuda; CaptureError where cuda is asked for and not there."""
+    import torch
+
+    if device == "cuda" and not torch.cuda.is_available():
+        raise CaptureError("--device: wanted a CUDA device, given a machine on which torch finds none; use --device cpu or auto")
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+
+
+def photometric_stereo(capture: Capture, lights: Lights) -> tuple[NormalMap, ...]:
+    """Photometric stereo of every view on its own, on all cores."""
+    import os
+    from concurrent.futures import ThreadPoolExecutor
+
+    from mvps.photometric import normal_map
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return tuple(pool.map(normal_map, capture.views, lights.direction, lights.intensity))
+
+
+def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
+    """The visual hull as a grid and as a surface."""
+    from mvps.hull import default_cells, signed_distance, visual_hull
+
+    with progress.stage("visual hull") as stage:
+        grid = signed_distance(capture, default_cells(capture))
+        surface = visual_hull(grid)
+        stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing:.3g} units")
+    return grid, surface
+
+
+def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed: int, progress: Progress) -> Lights:
+    """The given lights, or those of the uncalibrated factorisation."""
+    from mvps.calibrate import uncalibrated_lights
+
+    with progress.stage("lights") as stage:
+        if given is not None:
+            stage.status("given with the capture")
+            return given
+        calibration = uncalibrated_lights(capture, surface, seed)
+        kind = "one rig for all views" if calibration.lights.one_rig else "lights of every view on their own"
+        stage.status(f"{kind}; three factors leave {100 * calibration.residual:.1f} % of the images")
+        return calibration.lights
+
+
+def stage_two(
+    capture: Capture, surface: Surface, lights: Lights, maps: tuple[NormalMap, ...], settings: Settings, free_lights: bool, progress: Progress
+) -> Refined:
+    """Stage II under the progress bar."""
+    from mvps.joint.refine import refine
+
+    plan = refine_settings(settings.preset, free_lights)
+    with progress.stage("joint refinement", total=len(plan.rounds)) as stage:
+
+        def on_round(_: int, changes: dict[str, float]) -> None:
+            stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
+
+        device = chosen_device(settings.device)
+        refined = refine(capture, surface, lights, maps, lambda new: photometric_stereo(capture, new), plan, settings.seed, device, on_round)
+        stage.status(refined.status)
+    return refined
+
+
+def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: Refined) -> Lights:
+    """Lights of every photograph of `capture`, in its order: refined where used, else carried over from the rig or fitted."""
+    import numpy as np
+
+    from mvps.joint.held_out import carried_over, fit_lights
+
+    known: dict[tuple[str, int], tuple[Any, Any]] = {}
+    for view, directions, intensities in zip(used.views, refined.lights.direction, refined.lights.intensity, strict=True):
+        known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
+    if held is not None and refined.lights.one_rig:
+        rotations = [view.camera.rotation for view in used.views]
+        for view in held.views:
+            directions, intensities = carried_over(refined.lights, rotations, view.camera.rotation)
+            rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
+            known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
+    if held is not None:
+        unknown = {view.name: [n for n in view.lights if (view.name, n) not in known] for view in held.views}
+        rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
+        if rest is not None:
+            shared = refined.lights.one_rig and len({view.lights for view in rest.views}) == 1
+            fitted = fit_lights(rest, refined.surface, refined.material, shared)
+            for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
+                known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
+    direction = tuple(np.array([known[view.name, n][0] for n in view.lights]) for view in capture.views)
+    intensity = tuple(np.array([known[view.name, n][1] for n in view.lights]) for view in capture.views)
+    return Lights(direction, intensity, refined.lights.one_rig)
+
+
+def normal_pictures(capture: Capture, refined: Refined) -> tuple[Any, ...]:
+    """Refined normals (height, width, 3) of every view, NaN outside the mask; a pixel that misses the mesh takes its nearest neighbour's."""
+    import numpy as np
+    from scipy.ndimage import distance_transform_edt
+
+    from mvps.rendering import points_under
+    from mvps.visibility import RayCaster
+
+    caster = RayCaster(refined.surface)
+    pictures = []
+    for view in capture.views:
+        points = points_under(caster, refined.material, view.camera, view.pixels)
+        picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
+        picture[view.mask] = np.where(points.hit[:, None], points.normal, np.nan)
+        empty = np.isnan(picture[..., 0])
+        if points.hit.any():
+            nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+            picture = picture[tuple(nearest)]
+        picture[~view.mask] = np.nan
+        pictures.append(picture)
+    return tuple(pictures)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the program and of the libraries that its figures depend on."""
+    import platform
+    from importlib.metadata import version
+
+    names = ("torch", "numpy", "scipy", "libigl", "embreex", "scikit-image", "gpytoolbox", "opencv-python-headless")
+    return {"mvps": __version__, "python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them."""
+    used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    grid, surface = rough_shape(used, progress)
+    start = first_lights(used, surface, lights, settings.seed, progress)
+    with progress.stage("photometric stereo"):
+        maps = photometric_stereo(used, start)
+    refined = stage_two(used, surface, start, maps, settings, lights is None, progress)
+    with progress.stage("lights and normals of all views"):
+        complete = all_lights(capture, used, held, refined)
+        pictures = normal_pictures(capture, refined)
+    metrics = {"stages": progress.stages, "rounds": refined.rounds, "status": {"name": refined.status, "text": refined.text}}
+    return Reconstruction(
+        refined.surface,
+        refined.material,
+        complete,
+        tuple(view.name for view in capture.views),
+        tuple(view.lights for view in capture.views),
+        pictures,
+        metrics,
+        {**asdict(settings), "versions": versions()},
+    )
+
+
+def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, out: Path, progress: Progress) -> None:
+    """Textures, report and the result folder."""
+    from mvps.export import write_reconstruction
+    from mvps.report import report_html
+    from mvps.texture import bake
+
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    with progress.stage("textures"):
+        textures = bake(reconstruction.surface, reconstruction.material, lights_of(reconstruction, used), used)
+    metrics = {**reconstruction.metrics, "stages": progress.stages}
+    finished = replace(reconstruction, metrics=metrics)
+    with progress.stage("report and files"):
+        write_reconstruction(finished, out, textures, report_html(finished, capture))
+
+
+def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
+    """The reconstruction's lights for just the photographs of `capture`."""
+    directions, intensities = [], []
+    for view in capture.views:
+        at = reconstruction.views.index(view.name)
+        rows = [reconstruction.light_names[at].index(n) for n in view.lights]
+        directions.append(reconstruction.lights.direction[at][rows])
+        intensities.append(reconstruction.lights.intensity[at][rows])
+    return Lights(tuple(directions), tuple(intensities), reconstruction.lights.one_rig)
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    made = parser("mvps.reconstruct", __doc__ or "")
+    made.add_argument("capture", type=Path, help="folder in the DiLiGenT-MV layout")
+    made.add_argument("--out", type=Path, required=True, help="result folder; an earlier result there is replaced")
+    made.add_argument("--preset", choices=PRESETS, default="standard", help="how much time to spend")
+    made.add_argument("--views", type=number_list, default=(), help="numbers of the views to read, counted from 1; all if not given")
+    made.add_argument("--lights", type=lights_argument, default=(), help="numbers of the lights, or a JSON file with a list per view")
+    made.add_argument("--hold-out-views", type=number_list, default=(), help="views kept back for evaluation")
+    made.add_argument("--hold-out-lights", type=number_list, default=(), help="lights kept back for evaluation")
+    made.add_argument("--calibrated-lights", action="store_true", help="use the lights given with the capture instead of solving them")
+    made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
+    made.add_argument("--seed", type=int, default=0, help="of all random draws")
+    given = parse(made, argv)
+    settings = Settings(
+        str(given.capture),
+        given.preset,
+        given.views,
+        given.lights,
+        given.hold_out_views,
+        given.hold_out_lights,
+        given.calibrated_lights,
+        given.device,
+        given.seed,
+    )
+    from mvps.load import read_calibrated_lights, read_capture
+
+    progress = Progress()
+    with progress.stage("load") as stage:
+        capture = read_capture(given.capture, given.views or None, given.lights or None)
+        stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    lights = read_calibrated_lights(given.capture, used) if given.calibrated_lights else None
+    reconstruction = reconstruct(capture, settings, lights, progress)
+    write(reconstruction, capture, settings, given.out, progress)
+    print(f"{given.out}: {reconstruction.metrics['status']['name']}. {reconstruction.metrics['status']['text']}")
+
+
+if __name__ == "__main__":
+    sys.exit(run(main))

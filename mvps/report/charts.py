@@ -1,0 +1,64 @@
+"""Drawings of numbers as SVG text: a line over rounds, lights on a sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+import numpy as np
+
+from mvps.pbr import srgb_bytes
+from mvps.scene import Float
+
+WIDTH, HEIGHT, LEFT, BOTTOM = 480, 220, 64, 34
+RADIUS = 100
+
+
+def line_chart(values: Sequence[float], across: str, up: str) -> str:
+    """One line through values at 1, 2, 3 ...; `across` and `up` name the axes."""
+    low, high = min(0.0, *values), max(0.0, *values)
+    span = (high - low) or 1.0
+    x = np.linspace(LEFT, WIDTH - 12, len(values)) if len(values) > 1 else np.array([(LEFT + WIDTH) / 2])
+    y = [12 + (high - v) / span * (HEIGHT - 12 - BOTTOM) for v in values]
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    dots = "".join(
+        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.5"><title>{v:.4g}</title></circle>' for a, b, v in zip(x, y, values, strict=True)
+    )
+    every = -(-len(values) // 10)
+    ticks = "".join(
+        f'<text x="{a:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{k + 1}</text>' for k, a in enumerate(x) if k % every == 0
+    )
+    base, label = HEIGHT - BOTTOM, f"{up} over {across}: " + ", ".join(f"{v:.4g}" for v in values)
+    return (
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">'
+        f'<path class="axis" d="M{LEFT - 8} 8V{base}H{WIDTH - 4}"/>'
+        f'<text x="{LEFT - 12}" y="16" text-anchor="end">{high:.3g}</text>'
+        f'<text x="{LEFT - 12}" y="{base}" text-anchor="end">{low:.3g}</text>'
+        f'{ticks}<text x="{(LEFT + WIDTH) / 2:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(across)}</text>'
+        f'<polyline class="line" points="{points}"/><g class="dots">{dots}</g></svg>'
+    )
+
+
+def light_sphere(direction: Float, intensity: Float, numbers: Sequence[int], name: str) -> str:
+    """Lights as seen from the camera: direction (lights, 3), x right, y up, z to the camera; areas are intensities (lights, 3).
+
+    A light behind the object (z < 0) is drawn hollow.
+    """
+    rings = "".join(f'<circle class="ring" r="{RADIUS * np.sin(np.radians(angle)):.1f}"/>' for angle in (30, 60, 90))
+    brightness = intensity.mean(1) / max(float(intensity.mean()), 1e-12)
+    marks = []
+    for k in np.argsort(direction[:, 2], kind="stable"):
+        x, y, z = direction[k]
+        colour = "#" + "".join(f"{c:02x}" for c in srgb_bytes(intensity[k] / intensity[k].max()))
+        fill = colour if z >= 0 else "none"
+        angle = np.degrees(np.arccos(np.clip(z, -1, 1)))
+        title = f"light {numbers[k]}: {angle:.0f} degrees from the view, intensity {brightness[k]:.2f}"
+        radius = 5 * float(np.sqrt(np.clip(brightness[k], 0.1, 4)))
+        place = f'cx="{RADIUS * x:.1f}" cy="{-RADIUS * y:.1f}" r="{radius:.1f}"'
+        marks.append(f'<circle class="light" {place} fill="{fill}"><title>{title}</title></circle>')
+    size = RADIUS + 14
+    label = f"{len(direction)} lights of {name} around the direction to the camera, rings at 30, 60 and 90 degrees"
+    return (
+        f'<figure><svg class="sphere" viewBox="{-size} {-size} {2 * size} {2 * size}" role="img" aria-label="{escape(label)}">'
+        f"{rings}{''.join(marks)}</svg><figcaption>{escape(name)}</figcaption></figure>"
+    )

@@ -1,0 +1,213 @@
+"""The page: a heading with the outcome, then one section for each thing that the reconstruction knows about itself."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.report.charts import light_sphere, line_chart
+from mvps.report.pictures import data_address, view_pictures
+from mvps.scene import Capture, Reconstruction, View
+from mvps.visibility import RayCaster
+
+VIEWS_SHOWN = 4
+
+STYLE = """
+:root{color-scheme:light dark;--ink:#1c1c1c;--paper:#fff;--line:#d0d0d0;--soft:#f3f3f1;--mark:#b4501e}
+@media(prefers-color-scheme:dark){:root{--ink:#e8e8e8;--paper:#161616;--line:#444;--soft:#222;--mark:#f0904f}}
+body{font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--paper);margin:0 auto;max-width:72rem;padding:1rem}
+h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
+.status{padding:.7em 1em;background:var(--soft);border-left:4px solid var(--mark)}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(7rem,1fr));gap:.6rem}
+figure{margin:0}figure img{width:100%;height:auto;display:block}figcaption{font-size:.85rem}
+.wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
+th,td{text-align:left;padding:.25em .8em .25em 0;border-bottom:1px solid var(--line);vertical-align:top}
+.number{text-align:right;font-variant-numeric:tabular-nums}
+.bar{display:inline-block;height:.7em;background:var(--mark)}
+svg{width:100%;max-width:30rem;height:auto;font-size:12px}svg text{fill:currentColor}
+.axis,.ring{fill:none;stroke:var(--line)}.line{fill:none;stroke:var(--mark);stroke-width:2}.dots{fill:var(--mark)}
+.light{stroke:#777;stroke-width:1}.sphere{max-width:14rem}
+pre{background:var(--soft);padding:.8em;overflow-x:auto;font-size:.85rem}
+"""
+
+
+def write_report(reconstruction: Reconstruction, capture: Capture, path: Path) -> None:
+    """Write the page of a reconstruction and the capture it was made from (or part of it) to `path`, whole or not at all."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        beside.write_text(report_html(reconstruction, capture), encoding="utf-8")
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
+    """The page as text. Views and lights of the capture that the reconstruction does not hold are left out of the pictures."""
+    metrics = reconstruction.metrics
+    sections = [
+        _heading(reconstruction, capture),
+        _pictures(reconstruction, capture),
+        _lights(reconstruction, capture),
+        _rounds(metrics.get("rounds") or []),
+        _components((metrics.get("model") or {}).get("components") or []),
+        _truth(metrics.get("truth") or {}),
+        _stages(metrics.get("stages") or []),
+        _settings(reconstruction.settings),
+    ]
+    title = escape(f"Reconstruction of {capture.name}")
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{STYLE}</style></head>\n<body>\n" + "\n".join(filter(None, sections)) + "\n</body></html>\n"
+    )
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>\n{content}</section>"
+
+
+def _shown(value: Any) -> str:
+    """A value as text: four digits for a number, words for yes, no and nothing."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    """A table; numbers stand to the right. All cells but _Html are escaped."""
+    numeric = [any(_is_number(row[k]) for row in rows) for k in range(len(head))]
+
+    def cells(tag: str, values: Sequence[Any]) -> str:
+        kinds = [' class="number"' if right else "" for right in numeric]
+        texts = [value.html if isinstance(value, _Html) else escape(_shown(value)) for value in values]
+        return "<tr>" + "".join(f"<{tag}{kind}>{text}</{tag}>" for kind, text in zip(kinds, texts, strict=True)) + "</tr>"
+
+    body = "".join(cells("td", row) for row in rows)
+    return f'<div class="wide"><table><thead>{cells("th", head)}</thead><tbody>{body}</tbody></table></div>'
+
+
+class _Html:
+    """Text that is HTML already."""
+
+    def __init__(self, html: str) -> None:
+        self.html = html
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _columns(records: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> str:
+    """A table of records with the columns (key: title) that at least one of them has."""
+    kept = {key: title for key, title in names.items() if any(key in record for record in records)}
+    return _table(list(kept.values()), [[record.get(key, "") for key in kept] for record in records])
+
+
+def _heading(reconstruction: Reconstruction, capture: Capture) -> str:
+    surface, metrics = reconstruction.surface, reconstruction.metrics
+    photographs = sum(map(len, reconstruction.light_names))
+    rig = "stand still in the camera's frame" if reconstruction.lights.one_rig else "differ between views"
+    facts = [
+        f"{len(surface.vertices):,} vertices and {len(surface.faces):,} faces from {len(reconstruction.views)} views with"
+        f" {photographs} photographs; the lights {rig}."
+    ]
+    seconds = [stage["seconds"] for stage in metrics.get("stages") or [] if _is_number(stage.get("seconds"))]
+    if seconds:
+        facts.append(f"{sum(seconds):.1f} s in all.")
+    status = metrics.get("status") or {}
+    words = ": ".join(str(status[key]) for key in ("name", "text") if status.get(key))
+    outcome = f'<p class="status">{escape(words)}</p>' if words else ""
+    return f"<h1>{escape(capture.name)}</h1>\n<p>{escape(' '.join(facts))}</p>\n{outcome}"
+
+
+def _known_views(reconstruction: Reconstruction, capture: Capture) -> list[View]:
+    """Up to VIEWS_SHOWN views, spread, of which both the capture and the result hold a photograph."""
+    numbers = dict(zip(reconstruction.views, reconstruction.light_names, strict=True))
+    known = [v for v in capture.views if len(v.pixels) and set(v.lights) & set(numbers.get(v.name, ()))]
+    shown = min(len(known), VIEWS_SHOWN)
+    return [known[k * len(known) // shown] for k in range(shown)]
+
+
+def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
+    views = _known_views(reconstruction, capture)
+    if not views:
+        return ""
+    caster = RayCaster(reconstruction.surface)
+    parts = []
+    for view in views:
+        light, pictures = view_pictures(caster, reconstruction, view)
+        figures = "".join(
+            f'<figure><img src="{data_address(p.image)}" width="{p.image.shape[1]}" height="{p.image.shape[0]}"'
+            f' alt="{escape(p.text)}"><figcaption>{escape(p.title)}</figcaption></figure>'
+            for p in pictures
+        )
+        parts.append(f'<h3>{escape(view.name)}, {escape(light)}</h3><div class="grid">{figures}</div>')
+    return _section("Views", "\n".join(parts))
+
+
+def _lights(reconstruction: Reconstruction, capture: Capture) -> str:
+    """One sphere for a rig, one for each view shown otherwise; in the camera's frame with y up."""
+    views = _known_views(reconstruction, capture)[: 1 if reconstruction.lights.one_rig else VIEWS_SHOWN]
+    spheres = []
+    for view in views:
+        place = reconstruction.views.index(view.name)
+        local = reconstruction.lights.direction[place] @ view.camera.rotation.T @ DILIGENT_FROM_CAMERA
+        name = "all views" if reconstruction.lights.one_rig else view.name
+        spheres.append(light_sphere(local, reconstruction.lights.intensity[place], reconstruction.light_names[place], name))
+    if not spheres:
+        return ""
+    words = "<p>As the camera sees them; rings at 30, 60 and 90 degrees, areas are intensities, hollow ones are behind the object.</p>"
+    return _section("Lights", words + f'<div class="grid">{"".join(spheres)}</div>')
+
+
+ROUND_COLUMNS = {
+    "round": "round",
+    "residual": "residual",
+    "light_change_deg": "lights moved, deg",
+    "normal_change_deg": "normals moved, deg",
+    "vertex_change_px": "vertices moved, px",
+}
+
+
+def _rounds(rounds: Sequence[Mapping[str, Any]]) -> str:
+    if not rounds:
+        return ""
+    residuals = [float(r["residual"]) for r in rounds if _is_number(r.get("residual"))]
+    chart = line_chart(residuals, "round", "residual") if residuals else ""
+    return _section("Rounds", chart + _columns(rounds, ROUND_COLUMNS))
+
+
+def _components(components: Sequence[Mapping[str, Any]]) -> str:
+    names = {"name": "component", "kept": "kept", "gain": "gain", "seconds": "time, s", "why": "why"}
+    return _section("Reflectance model", _columns(components, names)) if components else ""
+
+
+def _truth(truth: Mapping[str, Any]) -> str:
+    rows = [(key.replace("_", " "), value) for key, value in truth.items()]
+    return _section("Against ground truth", _table(["measure", "value"], rows)) if rows else ""
+
+
+def _stages(stages: Sequence[Mapping[str, Any]]) -> str:
+    if not stages:
+        return ""
+    longest = max((s["seconds"] for s in stages if _is_number(s.get("seconds"))), default=0) or 1
+    shown = [
+        {**s, "bar": _Html(f'<span class="bar" style="width:{6 * s["seconds"] / longest:.2f}rem"></span>')}
+        if _is_number(s.get("seconds"))
+        else s
+        for s in stages
+    ]
+    names = {"name": "stage", "seconds": "time, s", "bar": "", "peak_memory_mb": "peak memory so far, MB", "status": "outcome"}
+    return _section("Time and memory", _columns(shown, names))
+
+
+def _settings(settings: Mapping[str, Any]) -> str:
+    text = json.dumps(settings, indent=1, sort_keys=True, ensure_ascii=False)
+    return _section("Settings", f"<pre>{escape(text)}</pre>") if settings else ""

@@ -1,0 +1,94 @@
+"""Pictures of a view: photograph, re-rendering and what the re-rendering is made of, under one of the view's lights."""
+
+from __future__ import annotations
+
+import base64
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.mesh import mean_edge_length
+from mvps.pbr import reflectance_scale, srgb_bytes
+from mvps.rendering import photograph, points_under, shadow_at
+from mvps.scene import Bool, Float, Reconstruction, View
+from mvps.visibility import RayCaster
+
+LARGEST_SIDE = 360
+"""Pixels of a picture: sharp in one of two columns of a phone, and 28 of them stay far below the page's limit."""
+JPEG_QUALITY = 85
+ERROR_SPAN = 0.25
+"""Error that is drawn brightest, as a share of the photograph's white."""
+
+
+class Picture(NamedTuple):
+    """A picture (height, width, 3) uint8 RGB, its title and a sentence for those who do not see it."""
+
+    image: NDArray[np.uint8]
+    title: str
+    text: str
+
+
+def view_pictures(caster: RayCaster, reconstruction: Reconstruction, view: View) -> tuple[str, list[Picture]]:
+    """The light shown ("light 3") and the pictures of a view that the result holds."""
+    place = reconstruction.views.index(view.name)
+    shared = [k for k, number in enumerate(view.lights) if number in reconstruction.light_names[place]]
+    # The photograph of middling brightness shows both lit and shadowed parts.
+    brightness = view.samples[:, shared].mean((0, 2))
+    chosen = shared[int(np.argsort(brightness, kind="stable")[len(shared) // 2])]
+    row = reconstruction.light_names[place].index(view.lights[chosen])
+    direction, intensity = (values[place][row : row + 1] for values in (reconstruction.lights.direction, reconstruction.lights.intensity))
+    material, offset = reconstruction.material, mean_edge_length(caster.surface)
+    measured = view.radiance([chosen])[:, 0]
+    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset)[:, 0]
+    dark = replace(material, albedo=np.zeros_like(material.albedo))
+    specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity, offset)[:, 0]
+    points = points_under(caster, material, view.camera, view.pixels)
+    cast = shadow_at(caster, points, direction, offset)[:, 0]
+    attached = points.normal @ direction[0] <= 0
+    white = float(np.percentile(measured, 99.5)) or 1.0
+    error = np.abs(measured - rendered).mean(1) / white
+    normals = points.normal @ view.camera.rotation.T @ DILIGENT_FROM_CAMERA
+    shadow = np.where(attached, 0.45, np.where(cast, 0.0, 1.0))[:, None].repeat(3, 1)
+    mean_error = f"mean absolute error {100 * error.mean():.1f} % of white"
+    rows: list[tuple[str, str, NDArray[np.uint8]]] = [
+        ("photograph", "what the camera saw", srgb_bytes(measured / white)),
+        ("re-rendering", "the reconstruction under the same light", srgb_bytes(rendered / white)),
+        (f"error, white = {100 * ERROR_SPAN:.0f} %", mean_error, _heat(error / ERROR_SPAN)),
+        ("normals", "x red, y green, z to the camera blue", np.rint((normals + 1) * 127.5).clip(0, 255).astype(np.uint8)),
+        ("albedo", "the colour without light and gloss", srgb_bytes(points.albedo / reflectance_scale(material))),
+        ("specular", "the gloss of the re-rendering alone", srgb_bytes(specular / white)),
+        ("shadow", "black: cast, grey: attached, white: lit", np.rint(shadow * 255).astype(np.uint8)),
+    ]
+    return f"light {view.lights[chosen]}", [
+        Picture(_on_image(view.mask, values), title, f"{title} of {view.name}: {text}") for title, text, values in rows
+    ]
+
+
+def data_address(image: NDArray[np.uint8]) -> str:
+    """The picture (height, width, 3) RGB as a JPEG inside an address of its own (RFC 2397)."""
+    data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
+
+
+def _heat(values: Float) -> NDArray[np.uint8]:
+    """(n, 3) colours from black over red and yellow to white of values (n,), clipped to [0, 1]."""
+    colours: NDArray[np.uint8] = np.rint(255 * np.clip(3 * np.clip(values, 0, 1)[:, None] - (0, 1, 2), 0, 1)).astype(np.uint8)
+    return colours
+
+
+def _on_image(mask: Bool, values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Values (pixels, 3) on the image, cut to the foreground and reduced to LARGEST_SIDE."""
+    image: Any = np.full((*mask.shape, 3), 24, np.uint8)
+    image[mask] = values
+    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    image = image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    shrink = LARGEST_SIDE / max(image.shape[:2])
+    if shrink < 1:
+        size = (max(1, round(image.shape[1] * shrink)), max(1, round(image.shape[0] * shrink)))
+        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    cut: NDArray[np.uint8] = image
+    return cut

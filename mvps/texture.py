@@ -1,0 +1,257 @@
+"""Textures of a reconstruction: base colour from the photographs, tangent-space normals, roughness, specular colour.
+
+Base colour. In every view, each foreground pixel with first hit x gets one albedo, from all its lights:
+
+    minimise over a   sum_l log(1 + r_l^2 / b^2),   r_l = I_l - E_l (a (n.l)+ + specular_l),     E intensity of the light,
+
+over unsaturated samples of lights that reach x, by reweighted least squares. With the scale b, half the mean of |r|, highlights,
+shadow borders and inter-reflections count as outliers (Cauchy's weights: Holland and Welsch 1977). A texel takes the mean of
+these albedos, interpolated between pixels, over the views that see it, with weights of the squared density of pixels on the
+surface, (cos(view angle) / footprint^2)^2, so that the nearest and most frontal views decide. A view sees a texel where the
+first hits of the surrounding pixels lie at the texel. A texel that no view sees keeps the vertices' albedo.
+
+Normal map. T, N: interpolated tangent and mesh normal, B = N x T; the refined normal n is stored as (x, y, z) with
+x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
+from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
+from mvps.mesh import face_areas, mean_edge_length, normalise, vertex_normals
+from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
+from mvps.rendering import photograph, points_under
+from mvps.scene import Bool, Capture, Float, Lights, Material, Surface, View
+from mvps.visibility import RayCaster
+
+TEXELS_PER_PIXEL = 2
+"""Texels along one pixel's footprint: interpolating twice (photograph, texture) then loses little of what pixels hold."""
+LARGEST_SIDE = 4096
+"""Textures larger than this, texels, do not load on every graphics card."""
+FILLED = 0.4
+"""Share of an atlas that charts cover, about; used only to keep below LARGEST_SIDE."""
+SAMPLES_PER_CHUNK = 1 << 20
+TEXELS_PER_CHUNK = 1 << 18
+REWEIGHTINGS = 4
+STEEPEST_VIEW = 0.2
+"""Smallest cosine between normal and view direction: beyond, one pixel spreads over more than five texels."""
+
+
+@dataclass(frozen=True, eq=False)
+class Textures:
+    """An atlas with its pictures, each (height, width) of the atlas.
+
+    mesh_normal       (V, 3) unit vertex normals that the normal map is relative to
+    base_color        (h, w, 3) uint8 sRGB of albedo / scale, with the scale of mvps.pbr for the texels
+    normal_map        (h, w, 3) uint8;  roughness (h, w) uint8, linear
+    specular_color    (h, w, 3) uint8 sRGB of F0 / specular_level, the largest F0 (mvps.pbr)
+    from_photographs  share of texels that a view saw
+    """
+
+    atlas: Atlas
+    mesh_normal: Float
+    base_color: NDArray[np.uint8]
+    normal_map: NDArray[np.uint8]
+    roughness: NDArray[np.uint8]
+    specular_color: NDArray[np.uint8]
+    specular_level: float
+    scale: float
+    from_photographs: float
+
+
+def bake(surface: Surface, material: Material, lights: Lights, capture: Capture) -> Textures:
+    """Textures of a surface with its material, from a capture's photographs under lights (in the order of the capture's views).
+
+    ValueError where the lights do not fit the capture's photographs.
+    """
+    _check_lights(lights, capture)
+    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    smallest = np.sqrt(face_areas(surface).sum() / FILLED) / LARGEST_SIDE
+    atlas = build_atlas(surface, max(pixel / TEXELS_PER_PIXEL, float(smallest)))
+    texels = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
+    mesh_normal = vertex_normals(surface)
+    position, normal = (_at(texels, surface, values) for values in (surface.vertices, normalise(mesh_normal)))
+    albedo, seen = _photographed_albedo(surface, material, lights, capture, position, normalise(normal))
+    albedo = np.where(seen[:, None], albedo, _at(texels, surface, material.albedo))
+    weight = _at(texels, surface, material.specular_weight)
+    specular = specular_energy(weight, material.sharpness)
+    scale = white_level(albedo + specular)
+    specular /= scale
+    level = min(white_level(specular), 1.0) if (specular > 0).any() else 0.0
+    shading = _tangent_space(atlas, texels, mesh_normal, _at(texels, surface, material.normal))
+    return Textures(
+        atlas=atlas,
+        mesh_normal=mesh_normal,
+        base_color=_picture(atlas, texels, srgb_bytes(albedo / scale)),
+        normal_map=_picture(atlas, texels, np.rint((shading + 1) * 127.5).astype(np.uint8)),
+        roughness=_picture(atlas, texels, np.rint(roughness(weight, material.sharpness) * 255).astype(np.uint8)),
+        specular_color=_picture(atlas, texels, srgb_bytes(specular / (level or 1.0))),
+        specular_level=level,
+        scale=scale,
+        from_photographs=float(seen.mean()) if len(seen) else 0.0,
+    )
+
+
+def png_bytes(image: NDArray[Any]) -> bytes:
+    """An RGB or grey image (height, width[, 3]) of 8 or 16 bit as a PNG file. ValueError where it is another kind of array."""
+    # OpenCV stores other depths as 8 bit without an error.
+    if image.dtype not in (np.uint8, np.uint16) or not image.size or image.shape[2:] not in ((), (3,)):
+        raise ValueError(f"image: wanted (height, width[, 3]) uint8 or uint16, not empty, given {image.shape} {image.dtype}")
+    stored = image[..., ::-1] if image.ndim == 3 else image
+    data: bytes = cv2.imencode(".png", np.ascontiguousarray(stored))[1].tobytes()
+    return data
+
+
+def pixel_albedo(
+    caster: RayCaster, material: Material, view: View, direction: Float, intensity: Float, offset: float
+) -> tuple[Float, NDArray[np.float32], Bool]:
+    """What the pixels of a view say of the albedo: first hits (pixels, 3), albedo (pixels, 3), and where there is one (pixels,)."""
+    position = np.zeros((len(view.pixels), 3))
+    albedo = np.zeros((len(view.pixels), 3), np.float32)
+    known = np.zeros(len(view.pixels), bool)
+    bright = replace(material, albedo=np.ones_like(material.albedo))
+    step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
+    for start in range(0, len(position), step):
+        part = slice(start, start + step)
+        pixels = view.pixels[part]
+        points = points_under(caster, material, view.camera, pixels)
+        # An image with albedo 1 holds diffuse + specular; its diffuse part is known, and zero says: no light arrives.
+        model = photograph(caster, bright, view.camera, pixels, direction, intensity, offset)
+        diffuse = (points.normal @ direction.T).clip(0).astype(np.float32)[..., None] * intensity.astype(np.float32)
+        usable: Bool = (model[..., 0] > 0) & (diffuse[..., 0] > 0) & _usable(view, part)
+        measured = view.samples[part].astype(np.float32) * np.float32(view.scale) - (model - diffuse)
+        position[part] = points.position
+        albedo[part] = _robust_albedo(measured, diffuse, usable)
+        known[part] = points.hit & usable.any(1)
+    return position, albedo, known
+
+
+def _usable(view: View, part: slice) -> Bool:
+    below = view.samples[part] < view.saturation
+    usable: Bool = below[..., 0] & below[..., 1] & below[..., 2]
+    return usable
+
+
+def _robust_albedo(measured: NDArray[np.float32], diffuse: NDArray[np.float32], usable: Bool) -> NDArray[np.float32]:
+    """(n, 3) robust fit a >= 0 of measured to a diffuse, over the usable (n, lights) of (n, lights, 3); 0 where none is."""
+    weight: Any = np.broadcast_to(usable[..., None], diffuse.shape).astype(np.float32)
+    tiny = np.float32(1e-30)
+    for _ in range(REWEIGHTINGS):
+        weighted = weight * diffuse
+        albedo = _over_lights(weighted, measured) / np.maximum(_over_lights(weighted, diffuse), tiny)
+        residual = np.abs(measured - albedo[:, None] * diffuse) * usable[..., None]
+        bound = np.einsum("nlc->nc", residual)[:, None] / (2 * residual.shape[1]) + np.float32(1e-12)
+        weight = usable[..., None] / (1 + (residual / bound) ** 2)
+    solved: NDArray[np.float32] = albedo.clip(0)
+    return solved
+
+
+def _over_lights(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n, 3) sum over the lights of a b (n, lights, 3); einsum is several times faster here than a product and its sum."""
+    total: NDArray[np.float32] = np.einsum("nlc,nlc->nc", a, b)
+    return total
+
+
+def _check_lights(lights: Lights, capture: Capture) -> None:
+    given = [len(direction) for direction in lights.direction]
+    wanted = [len(view.lights) for view in capture.views]
+    if given != wanted:
+        raise ValueError(f"lights: wanted one per photograph of every view ({wanted}), given {given}")
+
+
+def _at(texels: Texels, surface: Surface, values: Float) -> Float:
+    """(n, ...) values (V, ...) on the surface's vertices, interpolated at texels."""
+    weights = texels.barycentric.reshape(texels.barycentric.shape + (1,) * (values.ndim - 1))
+    interpolated: Float = sum(values[surface.faces[texels.face, k]] * weights[:, k] for k in range(3))
+    return interpolated
+
+
+def _photographed_albedo(
+    surface: Surface, material: Material, lights: Lights, capture: Capture, position: Float, normal: Float
+) -> tuple[Float, Bool]:
+    """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
+    caster = RayCaster(surface)
+    offset = mean_edge_length(surface)
+    total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
+
+    def solved(i: int) -> tuple[Float, NDArray[np.float32], Bool]:
+        hit, albedo, known = pixel_albedo(caster, material, capture.views[i], lights.direction[i], lights.intensity[i], offset)
+        return hit, albedo, known & _away_from_border(capture.views[i])
+
+    for view, (hit, albedo, known) in zip(capture.views, _on_all_cores(solved, len(capture.views)), strict=True):
+        for start in range(0, len(position), TEXELS_PER_CHUNK):
+            part = slice(start, start + TEXELS_PER_CHUNK)
+            sampled, weight = _sampled(view, hit, albedo, known, position[part], normal[part])
+            total[part] += weight[:, None] * sampled
+            weights[part] += weight
+    seen = weights > 0
+    total[seen] /= weights[seen, None]
+    return total, seen
+
+
+def _on_all_cores(task: Callable[[int], Any], total: int) -> Iterator[Any]:
+    """task(0), task(1) ... in this order, no more of them at a time than there are cores: numpy, torch and Embree release the lock."""
+    cores = len(os.sched_getaffinity(0))
+    with ThreadPoolExecutor(cores) as pool:
+        for start in range(0, total, cores):
+            yield from pool.map(task, range(start, min(start + cores, total)))
+
+
+def _away_from_border(view: View) -> Bool:
+    """(pixels,) False where one of the eight neighbours is background: such a pixel may be mixed with it."""
+    inner = cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    away: Bool = inner[view.mask] > 0
+    return away
+
+
+def _sampled(view: View, hit: Float, albedo: NDArray[np.float32], known: Bool, position: Float, normal: Float) -> tuple[Float, Float]:
+    """Albedo (n, 3) of the pixels around surface points (n, 3) and its weight (n,), 0 where the view does not see the point."""
+    facing = (normal * view_directions(view.camera, position)).sum(-1)
+    image, depth = project(view.camera, position)
+    chosen = np.flatnonzero((facing > STEEPEST_VIEW) & (depth > 0) & inside_image(view.camera, image))
+    where, share = bilinear(view.pixel_index, image[chosen])
+    pixel = footprint(view.camera, position[chosen])
+    # The four pixels around the point hit the surface within a diagonal of it, stretched by the slope.
+    near = np.linalg.norm(hit[where] - position[chosen, None], axis=-1) < (np.sqrt(2) * pixel / facing[chosen])[:, None]
+    share = share * (near & known[where])
+    total = share.sum(1)
+    # Where the point hides behind another part, all four pixels hit that part instead.
+    sees = total > 0.5
+    result, weight = np.zeros((len(position), 3)), np.zeros(len(position))
+    result[chosen[sees]] = (share[sees, :, None] * albedo[where[sees]]).sum(1) / total[sees, None]
+    density = facing[chosen] / pixel**2
+    weight[chosen[sees]] = (density**2 * total)[sees]
+    return result, weight
+
+
+def _tangent_space(atlas: Atlas, texels: Texels, mesh_normal: Float, refined: Float) -> Float:
+    """(n, 3) refined normals (n, 3) in the basis of tangent, bitangent and mesh normal (V, 3) at the texels; unit, z >= 0."""
+    corner = atlas.faces[texels.face]
+    tangents = vertex_tangents(atlas, mesh_normal)
+    t, n = (normalise((values[corner] * texels.barycentric[..., None]).sum(1)) for values in (tangents, mesh_normal[atlas.vertex]))
+    b, r = normalise(np.cross(n, t)), normalise(refined)
+    # Interpolated t and n are not exactly perpendicular: solve x t + z n for the part of r in their plane.
+    skew, along_t, along_n = (t * n).sum(-1), (r * t).sum(-1), (r * n).sum(-1)
+    square = np.maximum(1 - skew**2, 1e-12)
+    local = np.stack([(along_t - skew * along_n) / square, (r * b).sum(-1), (along_n - skew * along_t) / square], -1)
+    local[:, 2] = local[:, 2].clip(0)
+    return normalise(local)
+
+
+def _picture(atlas: Atlas, texels: Texels, values: NDArray[Any]) -> NDArray[Any]:
+    """Values (n, ...) of texels as a picture, its charts padded."""
+    image = np.zeros((atlas.height, atlas.width, *values.shape[1:]), values.dtype)
+    filled = np.zeros((atlas.height, atlas.width), bool)
+    image[texels.row, texels.column] = values
+    filled[texels.row, texels.column] = True
+    return padded(image, filled)

@@ -1,0 +1,128 @@
+"""What sees what: first hits, cast shadows and visible vertices on a triangle mesh, by Embree.
+
+A ray that leaves the mesh starts `offset` away from it along the surface normal: a triangle mesh stands for a smooth
+surface only up to its own resolution, so nearer occluders are an artefact of the facets (shadow acne), not of the shape.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from mvps.camera import pixel_centres, project, rays, view_directions
+from mvps.mesh import vertex_normals
+from mvps.scene import Bool, Camera, Float, Int, Surface
+
+RAYS_PER_CALL = 1 << 18
+
+
+class Hits(NamedTuple):
+    """First hits of n rays: face (n,) or -1; barycentric (n, 3) of the face's corners; distance (n,) along the ray, inf for a miss."""
+
+    face: Int
+    barycentric: Float
+    distance: Float
+
+
+class RayCaster:
+    """A mesh that can be asked many times. Vertices are centred and scaled for Embree's single precision."""
+
+    def __init__(self, surface: Surface) -> None:
+        vertices = surface.vertices
+        self._centre = (vertices.min(0) + vertices.max(0)) / 2
+        self._scale = float(np.abs(vertices - self._centre).max()) or 1.0
+        self._scene = EmbreeScene(robust=True)
+        self._mesh = TriangleMesh(self._scene, self._local(vertices), surface.faces.astype(np.int32))
+        # The first query builds the tree; later queries may then come from several threads.
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
+        self.surface = surface
+
+    @cached_property
+    def vertex_normals(self) -> Float:
+        """(V, 3) vertex normals of the mesh, computed when first asked for."""
+        return vertex_normals(self.surface)
+
+    def _local(self, points: Float) -> Any:
+        return np.ascontiguousarray((points - self._centre) / self._scale, dtype=np.float32)
+
+    def first_hits(self, origins: Float, directions: Float) -> Hits:
+        """First hits of rays from origins (n, 3) along unit directions (n, 3)."""
+        chunks = _in_chunks(
+            lambda s: self._scene.run(self._local(origins[s]), directions[s].astype(np.float32), query="INTERSECT", output=1),
+            len(origins),
+        )
+        joined = {k: np.concatenate([c[k] for c in chunks]) if chunks else np.zeros(0) for k in ("primID", "u", "v", "tfar")}
+        face = joined["primID"].astype(np.int64)
+        u, v = joined["u"].astype(np.float64), joined["v"].astype(np.float64)
+        miss = face < 0
+        barycentric = np.stack([1 - u - v, u, v], -1)
+        barycentric[miss] = 0
+        return Hits(face, barycentric, np.where(miss, np.inf, joined["tfar"].astype(np.float64) * self._scale))
+
+    def occluded(self, origins: Float, directions: Float) -> Bool:
+        """(n,) True where a ray from origins (n, 3) along unit directions (n, 3) meets the mesh."""
+        chunks = _in_chunks(
+            lambda s: self._scene.run(self._local(origins[s]), directions[s].astype(np.float32), query="OCCLUDED") >= 0,
+            len(origins),
+        )
+        return np.concatenate(chunks) if chunks else np.zeros(0, bool)
+
+
+def _in_chunks(query: Any, rays_total: int) -> list[Any]:
+    """`query` of consecutive slices of the rays, on all cores (Embree releases the interpreter's lock)."""
+    slices = [slice(i, i + RAYS_PER_CALL) for i in range(0, rays_total, RAYS_PER_CALL)]
+    if len(slices) < 2:
+        return [query(s) for s in slices]
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(query, slices))
+
+
+def camera_hits(caster: RayCaster, camera: Camera, pixels: Int) -> Hits:
+    """First hits of the rays through the centres of pixels (n, 2), given as row and column."""
+    return caster.first_hits(*rays(camera, pixel_centres(pixels)))
+
+
+def interpolate(surface: Surface, hits: Hits, values: Float) -> Float:
+    """Values (V, ...) on the vertices, interpolated at hits (n, ...); a miss gives zeros."""
+    corners = values[surface.faces[np.maximum(hits.face, 0)]]
+    weights = hits.barycentric.reshape(hits.barycentric.shape + (1,) * (values.ndim - 1))
+    interpolated: Float = (corners * weights).sum(1)
+    return interpolated
+
+
+def visible_vertices(caster: RayCaster, camera: Camera, normal: Float, offset: float) -> Bool:
+    """(V,) True where a vertex lies on the image, faces the camera and nothing hides it.
+
+    normal (V, 3) are the surface's vertex normals; offset, world units, is the length below which the mesh has no detail.
+    """
+    vertices = caster.surface.vertices
+    image, depth = project(camera, vertices)
+    towards = view_directions(camera, vertices)
+    candidates = (depth > 0) & ((normal * towards).sum(-1) > 0)
+    candidates &= (image >= 0).all(-1) & (image[:, 0] < camera.width) & (image[:, 1] < camera.height)
+    chosen = np.flatnonzero(candidates)
+    hidden = caster.occluded(vertices[chosen] + offset * normal[chosen], towards[chosen])
+    visible = np.zeros(len(vertices), bool)
+    visible[chosen[~hidden]] = True
+    return visible
+
+
+def cast_shadow(caster: RayCaster, vertices: Int, normal: Float, lights: Float, offset: float) -> Bool:
+    """(n, lights) True where another part of the mesh hides a light from a vertex.
+
+    vertices (n,) indices; normal (V, 3) vertex normals; lights (lights, 3) unit, world, towards the light;
+    offset as in `visible_vertices`. Only lights above the horizon are traced: below it the shadow is attached, not cast.
+    """
+    local = normal[vertices]
+    lit = local @ lights.T > 0
+    rows, columns = np.nonzero(lit)
+    origins = (caster.surface.vertices[vertices] + offset * local)[rows]
+    shadow = np.zeros(lit.shape, bool)
+    shadow[rows, columns] = caster.occluded(origins, lights[columns])
+    return shadow

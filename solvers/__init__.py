@@ -1,0 +1,1 @@
+"""Numerical optimisation on arrays; knows no images and no meshes."""

@@ -1,0 +1,354 @@
+"""Measures against scenes whose errors are known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import igl
+import numpy as np
+import pytest
+
+from mvps import measures
+from mvps.mesh import face_normals, mean_edge_length, vertex_normals
+from mvps.rendering import photograph
+from mvps.scene import Camera, Capture, Lights, Material, Reconstruction, Surface, Truth, View
+from mvps.visibility import RayCaster
+
+K = np.array([[400.0, 0, 32], [0, 400.0, 32], [0, 0, 1]])
+SIX_SIDES = [np.array(r, float) for r in ([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], [[0, -1, 0], [0, 0, -1], [1, 0, 0]])]
+
+
+def sphere(radius: float, divisions: int = 4) -> Surface:
+    v = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
+    f = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    for _ in range(divisions):
+        v, f = igl.upsample(v, f)
+        v /= np.linalg.norm(v, axis=-1, keepdims=True)
+    return Surface(radius * v, f)
+
+
+def plane(x0: float, x1: float, z: float, cells: int = 8) -> Surface:
+    """A rectangle over [x0, x1] x [-20, 20] at height z, its normal +z."""
+    x, y = np.linspace(x0, x1, cells + 1), np.linspace(-20, 20, cells + 1)
+    v = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full((cells + 1, cells + 1), z)], -1).reshape(-1, 3)
+    i = np.arange(cells * (cells + 1)).reshape(cells, cells + 1)[:, :-1].ravel()
+    a, b, c, d = i, i + cells + 1, i + cells + 2, i + 1
+    return Surface(v, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]))
+
+
+def camera(rotation: np.ndarray, distance: float = 500.0) -> Camera:
+    return Camera(K, rotation, np.array([0.0, 0.0, distance]), 64, 64)
+
+
+LOOKING_DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def view(name: str, cam: Camera, mask: np.ndarray, samples: np.ndarray | None = None) -> View:
+    samples = np.zeros((int(mask.sum()), 0, 3), np.uint16) if samples is None else samples
+    return View(name, cam, mask, samples, 1 / 65535, 65535, tuple(range(1, samples.shape[1] + 1)))
+
+
+def seen(surface: Surface, rotations: list[np.ndarray]) -> Capture:
+    """Views of a surface with their true masks."""
+    caster = RayCaster(surface)
+    views = []
+    for i, rotation in enumerate(rotations):
+        full = view("all", camera(rotation), np.ones((64, 64), bool))
+        mask = np.isfinite(measures.mesh_normals(caster, full)).all(-1)
+        views.append(view(f"view_{i + 1:02d}", full.camera, mask))
+    return Capture("test", tuple(views))
+
+
+# surface distance
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("offset", [0.7, -0.7])
+def test_concentric_spheres_are_their_radii_apart(offset: float, scale: float) -> None:
+    truth, result = sphere(25 * scale), sphere((25 + offset) * scale)
+    capture = seen(sphere(25), [LOOKING_DOWN, *SIX_SIDES])
+    cameras = [Camera(c.K, c.rotation, c.translation * scale, 64, 64) for c in (v.camera for v in capture.views)]
+    capture = Capture("test", tuple(replace(v, camera=c) for v, c in zip(capture.views, cameras, strict=True)))
+    errors = measures.surface_errors(result, truth, capture)
+    # The facets of both are parallel, and closer than the spheres by the ratio of inscribed to circumscribed radius.
+    assert errors["accuracy_mm"] == pytest.approx(abs(offset) * scale, rel=3e-3)
+    assert errors["completeness_mm"] == pytest.approx(abs(offset) * scale, rel=3e-3)
+    assert errors["chamfer_mm"] == pytest.approx((errors["accuracy_mm"] + errors["completeness_mm"]) / 2)
+    assert errors["pixel_mm"] == pytest.approx(500 / 400 * scale)
+    assert errors["chamfer_px"] == pytest.approx(abs(offset) * 400 / 500, rel=3e-3)
+    assert errors["offset_px"] == pytest.approx(offset * 400 / 500, rel=3e-3)
+    if scale == 1:
+        assert (errors["f_score_0_5_mm"], errors["f_score_1_mm"]) == (0, 1)
+        assert errors["mesh_coverage"] == (1 if offset > 0 else pytest.approx(0.95, abs=0.05))
+
+
+def test_a_moved_plane_is_as_far_as_it_was_moved() -> None:
+    truth = plane(-20, 20, 0)
+    capture = seen(truth, [LOOKING_DOWN])
+    errors = measures.surface_errors(plane(-40, 40, -0.3), truth, capture)
+    assert errors["completeness_mm"] == pytest.approx(0.3, abs=1e-9)
+    assert errors["offset_px"] == pytest.approx(-0.3 / errors["pixel_mm"], rel=1e-3)
+
+
+def test_the_missing_half_of_a_plane_counts_in_completeness_alone() -> None:
+    truth = plane(-20, 20, 0)
+    capture = seen(truth, [LOOKING_DOWN])
+    errors = measures.surface_errors(plane(-20, 0, 0), truth, capture)
+    x = measures.first_hit_points(truth, capture)[:, 0]
+    assert errors["accuracy_mm"] == pytest.approx(0, abs=1e-9)
+    assert errors["completeness_mm"] == pytest.approx(np.maximum(x, 0).mean())
+    recall = (x < 0.5).mean()
+    assert errors["f_score_0_5_mm"] == pytest.approx(2 * recall / (1 + recall))
+    assert errors["mesh_coverage"] == pytest.approx((x < 0).mean())
+
+
+def test_signs_are_right_everywhere_around_a_coarse_sphere() -> None:
+    """Near edges and corners too, where the nearest face's own normal would err."""
+    surface = sphere(10, 1)
+    points = np.random.default_rng(0).normal(size=(5000, 3)) * 8
+    distance, signed = measures.distance_to(points, surface)
+    # Convex: inside is below the planes of all faces.
+    corner = surface.vertices[surface.faces[:, 0]]
+    inside = ((points[:, None] - corner) * face_normals(surface)).sum(-1).max(1) < 0
+    assert inside.any() and not inside.all()
+    assert np.array_equal(signed < 0, inside)
+    assert np.array_equal(np.abs(signed), distance)
+    assert (distance[inside] <= 10).all()
+
+
+def test_a_face_without_area_does_no_harm() -> None:
+    ball = sphere(10, 2)
+    a, b, _ = ball.faces[0]
+    broken = Surface(ball.vertices, np.concatenate([ball.faces, [[0, 0, 0], [a, a, b]]]))
+    points = np.concatenate([ball.vertices * 1.2, ball.vertices * 0.9])
+    for whole, given in zip(measures.distance_to(points, ball), measures.distance_to(points, broken), strict=True):
+        assert np.allclose(np.abs(whole), np.abs(given)) and np.isfinite(given).all()
+
+
+def test_surfaces_that_no_camera_sees_are_refused() -> None:
+    truth = plane(-20, 20, 0)
+    capture = seen(truth, [LOOKING_DOWN])
+    with pytest.raises(ValueError, match="result mesh: wanted a surface in front"):
+        measures.surface_errors(plane(5000, 5020, 0), truth, capture)
+    with pytest.raises(ValueError, match="truth mesh: wanted a surface in front"):
+        measures.surface_errors(truth, plane(5000, 5020, 0), capture)
+
+
+# normals
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-7, 5.0, 89.9, 179.9999, 180.0])
+def test_angles_are_exact_from_nothing_to_opposite(degrees: float) -> None:
+    t = np.radians(degrees)
+    angle = measures.angles_deg(np.array([1.0, 0, 0]), np.array([np.cos(t), np.sin(t), 0]))
+    assert angle == pytest.approx(degrees, rel=1e-6, abs=1e-12)
+
+
+def tilted(normals: np.ndarray, degrees: float) -> np.ndarray:
+    """Every normal turned by so much about an axis perpendicular to it."""
+    across = np.cross(normals, (0.36, 0.48, 0.8))
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    return np.cos(np.radians(degrees)) * normals + np.sin(np.radians(degrees)) * across
+
+
+def test_normals_tilted_by_five_degrees_are_five_degrees_off() -> None:
+    ball = sphere(20)
+    capture = seen(ball, [LOOKING_DOWN, *SIX_SIDES])
+    truth = {v.name: measures.mesh_normals(RayCaster(ball), v) for v in capture.views}
+    estimated = {name: tilted(n, 5 if name != "view_02" else 20).astype(np.float32) for name, n in truth.items()}
+    errors = measures.normal_errors(estimated, truth, capture, ["view_02"])
+    pixels = np.array([v.mask.sum() for v in capture.views])
+    assert errors["fitted_normal_error_deg"] == pytest.approx(5, rel=1e-4)
+    assert errors["held_out_normal_error_deg"] == pytest.approx(20, rel=1e-4)
+    assert errors["normal_error_deg"] == pytest.approx((pixels * (5, 20, 5)).sum() / pixels.sum(), rel=1e-4)
+    assert errors["normal_error_median_deg"] == pytest.approx(5, rel=1e-4)
+    together = measures.normal_errors(estimated, truth, capture)
+    assert together["normal_error_deg"] == errors["normal_error_deg"]
+    assert set(together) == {"normal_error_deg", "normal_error_median_deg", "normal_coverage"}
+
+
+def test_pixels_without_an_estimate_show_in_the_coverage() -> None:
+    ball = sphere(20)
+    capture = seen(ball, [LOOKING_DOWN, *SIX_SIDES])
+    truth = {v.name: measures.mesh_normals(RayCaster(ball), v) for v in capture.views}
+    half = {name: n.copy() for name, n in truth.items()}
+    half["view_01"][:, :32] = np.nan
+    del half["view_03"]
+    errors = measures.normal_errors(half, truth, capture)
+    pixels = [int(v.mask.sum()) for v in capture.views]
+    assert errors["normal_error_deg"] == 0
+    right = int(capture.views[0].mask[:, 32:].sum())
+    assert errors["normal_coverage"] == pytest.approx((right + pixels[1]) / sum(pixels))
+    hole = {name: n.copy() for name, n in truth.items()}
+    hole["view_02"][:32] = np.nan
+    assert measures.normal_errors(truth, hole, capture)["normal_error_deg"] == 0, "a pixel without truth is no error"
+    assert measures.normal_errors(truth, hole, capture)["normal_coverage"] == 1, "nor does it count as not covered"
+    assert measures.normal_errors({}, truth, capture) == {"normal_coverage": 0}
+    assert measures.normal_errors(truth, {}, capture) == {}
+
+
+def test_a_smaller_ball_has_the_normals_of_the_law_of_sines() -> None:
+    """The ray at distance b from the centre meets a ball of radius r where the normal leaves its direction by asin(b / r)."""
+    truth_ball, result = sphere(20, 5), sphere(22, 5)
+    capture = seen(truth_ball, [LOOKING_DOWN])
+    v = capture.views[0]
+    truth = {v.name: measures.mesh_normals(RayCaster(truth_ball), v)}
+    errors = measures.mesh_normal_errors(result, truth, capture)
+    _, direction = measures_rays(v)
+    b = np.linalg.norm(np.cross(v.camera.centre, direction), axis=-1)
+    expected = np.degrees(np.arcsin(np.minimum(b / 20, 1)) - np.arcsin(b / 22))
+    assert errors["normal_error_deg"] == pytest.approx(expected.mean(), rel=0.02)
+    assert errors["normal_error_median_deg"] == pytest.approx(np.median(expected), rel=0.02)
+
+
+def measures_rays(v: View) -> tuple[np.ndarray, np.ndarray]:
+    from mvps.camera import pixel_centres, rays
+
+    return rays(v.camera, pixel_centres(v.pixels))
+
+
+# lights
+
+
+def ring(count: int) -> np.ndarray:
+    """Unit vectors in the plane z = 0."""
+    t = 2 * np.pi * np.arange(count) / count
+    return np.stack([np.cos(t), np.sin(t), 0 * t], -1)
+
+
+def lights(direction: np.ndarray, intensity: np.ndarray) -> dict[measures.Photograph, measures.Light]:
+    return {("view_01", k + 1): (direction[k], intensity[k]) for k in range(len(direction))}
+
+
+def test_lights_turned_by_three_degrees_are_three_degrees_off() -> None:
+    t = np.radians(3)
+    turn = np.array([[np.cos(t), -np.sin(t), 0], [np.sin(t), np.cos(t), 0], [0, 0, 1]])
+    intensity = np.random.default_rng(0).uniform(0.5, 2, (12, 3))
+    errors = measures.light_errors(lights(ring(12) @ turn.T, 7.3 * intensity), lights(ring(12), intensity))
+    assert errors["light_error_deg"] == pytest.approx(3)
+    assert errors["light_error_max_deg"] == pytest.approx(3)
+    assert errors["intensity_error"] == pytest.approx(0, abs=1e-12)
+
+
+def test_one_light_ten_per_cent_brighter() -> None:
+    """Of n equal lights one is estimated as 1.1: the scale is (n + 0.1) / (n + 0.21)."""
+    n, ones = 10, np.ones((10, 3))
+    brighter = ones.copy()
+    brighter[0] = 1.1
+    scale = (n + 0.1) / (n + 0.21)
+    errors = measures.light_errors(lights(ring(n), brighter), lights(ring(n), ones))
+    assert errors["intensity_error"] == pytest.approx((abs(1.1 * scale - 1) + (n - 1) * abs(scale - 1)) / n)
+    one_channel = ones * (1, 1, 1.1)
+    assert measures.light_errors(lights(ring(n), one_channel), lights(ring(n), ones))["intensity_error"] > 0.03
+
+
+def test_lights_are_matched_by_view_and_number() -> None:
+    truth = Truth(("view_01", "view_02"), {}, {"view_01": ring(6), "view_02": ring(6)[::-1]}, {"view_01": np.ones((6, 3))}, None)
+    known = measures.true_lights(truth)
+    assert set(known) == {("view_01", k) for k in range(1, 7)}, "view_02 has no intensities"
+    some = Lights((ring(6)[[4, 1]], ring(6)), (np.ones((2, 3)), np.ones((6, 3))), False)
+    estimated = measures.by_photograph(some, ("view_01", "view_02"), ((5, 2), (1, 2, 3, 4, 5, 6)))
+    errors = measures.light_errors(estimated, known)
+    assert (errors["light_error_deg"], errors["intensity_error"]) == (0, 0)
+    assert measures.light_errors(estimated, {}) == {}
+
+
+# photographs
+
+
+def photographed(noise: float, gain: float) -> tuple[Surface, Material, dict[measures.Photograph, measures.Light], Capture]:
+    """Two views of a ball under three lights with noise, and its lights, `gain` times too bright."""
+    ball = sphere(20)
+    n = len(ball.vertices)
+    material = Material(vertex_normals(ball), np.full((n, 3), (0.5, 0.4, 0.6)), np.full((n, 1), 0.1), np.array([20.0]), np.ones(n))
+    rng, caster, views, known = np.random.default_rng(0), RayCaster(ball), [], {}
+    for v in seen(ball, [LOOKING_DOWN, SIX_SIDES[0]]).views:
+        # Near the camera: hardly a pixel so dark that noise is cut off at zero.
+        direction = np.array([[0, 0, -1.0], [0.1, 0, -np.sqrt(0.99)], [0, 0.1, -np.sqrt(0.99)]]) @ v.camera.rotation
+        intensity = np.array([[1, 1, 1], [0.7, 0.8, 0.9], [1.2, 1.1, 1.0]])
+        image = photograph(caster, material, v.camera, v.pixels, direction, intensity, mean_edge_length(ball))
+        noisy = np.clip(image + rng.normal(0, noise, image.shape), 0, 1)
+        views.append(view(v.name, v.camera, v.mask, np.rint(noisy * 65535).astype(np.uint16)))
+        known |= {(v.name, k + 1): (direction[k], gain * intensity[k]) for k in range(3)}
+    return ball, material, known, Capture("test", tuple(views))
+
+
+def test_psnr_of_known_noise() -> None:
+    ball, material, known, capture = photographed(0.01, gain=3.0)
+    errors = measures.photograph_errors(ball, material, known, capture, ["view_02"])
+    assert errors["held_out_views_psnr_db"] == pytest.approx(40, abs=0.2)
+    assert errors["held_out_lights_psnr_db"] == pytest.approx(40, abs=0.2)
+    assert errors["photograph_scale"] == pytest.approx(1 / 3, rel=1e-3)
+
+
+def test_psnr_without_noise_is_that_of_rounding() -> None:
+    ball, material, known, capture = photographed(0.0, gain=1.0)
+    errors = measures.photograph_errors(ball, material, known, capture)
+    assert errors["held_out_lights_psnr_db"] == pytest.approx(20 * np.log10(65535) + 10 * np.log10(12), abs=1)
+    assert "held_out_views_psnr_db" not in errors
+
+
+def test_only_held_out_photographs_count() -> None:
+    ball, material, known, capture = photographed(0.01, gain=1.0)
+    wrong = Capture("test", tuple(replace(v, samples=np.where(np.arange(3)[None, :, None] == 1, v.samples, 0)) for v in capture.views))
+    only_second = {photo: light for photo, light in known.items() if photo[1] == 2}
+    assert measures.photograph_errors(ball, material, only_second, wrong)["held_out_lights_psnr_db"] > 39
+    assert measures.photograph_errors(ball, material, known, wrong)["held_out_lights_psnr_db"] < 30
+    assert measures.photograph_errors(ball, material, {}, capture) == {}
+
+
+def test_clipped_photographs_are_compared_with_a_clipped_rendering() -> None:
+    ball, material, known, capture = photographed(0.0, gain=1.0)
+    clipped = Capture("test", tuple(replace(v, samples=np.minimum(v.samples, 20000), saturation=20000) for v in capture.views))
+    errors = measures.photograph_errors(ball, material, known, clipped)
+    assert errors["held_out_lights_psnr_db"] > 90
+
+
+# all together
+
+
+def reconstruction(settings: dict[str, object]) -> tuple[Reconstruction, Capture, Truth]:
+    ball, material, known, capture = photographed(0.01, gain=1.0)
+    names = tuple(v.name for v in capture.views)
+    maps = {v.name: measures.mesh_normals(RayCaster(ball), v).astype(np.float32) for v in capture.views}
+    direction, intensity = ({name: np.stack([known[name, k][part] for k in (1, 2, 3)]) for name in names} for part in (0, 1))
+    both = Lights(tuple(direction.values()), tuple(intensity.values()), False)
+    made = Reconstruction(ball, material, both, names, ((1, 2, 3),) * 2, tuple(maps.values()), {}, settings)
+    return made, capture, Truth(names, maps, direction, intensity, ball)
+
+
+def test_a_perfect_reconstruction_has_no_errors() -> None:
+    errors = measures.evaluate(*reconstruction({}))
+    assert errors["chamfer_mm"] == pytest.approx(0, abs=1e-6)
+    for name in ("mesh_normal_error_deg", "map_normal_error_deg", "light_error_deg", "intensity_error"):
+        assert errors[name] == pytest.approx(0, abs=1e-4), name
+    assert errors["map_normal_coverage"] == 1
+    assert not [name for name in errors if "held_out" in name or "fitted" in name or "psnr" in name]
+    assert all(type(value) is float for value in errors.values())
+
+
+def test_what_is_held_out_gets_its_own_figures() -> None:
+    errors = measures.evaluate(*reconstruction({"hold_out_views": [2], "hold_out_lights": [3]}))
+    for name in ("mesh_held_out_normal_error_deg", "mesh_fitted_normal_error_deg", "map_held_out_normal_error_deg"):
+        assert name in errors
+    made, _, _ = reconstruction({"hold_out_views": [2], "hold_out_lights": [3]})
+    assert measures.held_out_views(made) == ("view_02",)
+    assert set(measures.held_out_photographs(made)) == {("view_01", 3), ("view_02", 1), ("view_02", 2), ("view_02", 3)}
+    assert errors["held_out_views_psnr_db"] == pytest.approx(40, abs=0.2)
+    assert errors["held_out_lights_psnr_db"] == pytest.approx(40, abs=0.2)
+
+
+def test_a_view_that_the_result_never_saw_counts_as_held_out() -> None:
+    made, capture, truth = reconstruction({})
+    first = slice(0, 1)
+    alone = Lights(made.lights.direction[first], made.lights.intensity[first], False)
+    made = Reconstruction(made.surface, made.material, alone, made.views[first], made.light_names[first], made.normal_maps[first], {}, {})
+    errors = measures.evaluate(made, capture, truth)
+    assert "mesh_held_out_normal_error_deg" in errors
+    assert "map_held_out_normal_error_deg" not in errors
+
+
+def test_what_the_truth_lacks_is_left_out() -> None:
+    made, capture, truth = reconstruction({"hold_out_views": [2]})
+    errors = measures.evaluate(made, capture, Truth(truth.views, {}, {}, {}, None))
+    assert set(errors) == {"held_out_views_psnr_db", "photograph_scale"}

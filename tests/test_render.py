@@ -1,0 +1,123 @@
+"""Re-rendering views: the photographs of a scene made by the same image model come out again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from sphere_scene import SphereScene, make_sphere
+
+import mvps.render
+from mvps.command import run
+from mvps.export import write_reconstruction
+from mvps.render import main, render_view
+from mvps.scene import CaptureError, Lights, Truth, View
+from mvps.synthetic.files import write_capture
+from mvps.visibility import RayCaster
+
+SPAN = 2.0
+"""Radiance of the scene's white; a capture that is read from files has white at 1."""
+
+
+def as_read(view: View) -> View:
+    return replace(view, scale=1 / 65535)
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    """Two views, intensities in units in which white is 1, as after reading the photographs from files."""
+    made = make_sphere(3)
+    r = made.reconstruction
+    views = made.capture.views[:2]
+    lights = Lights(r.lights.direction[:2], tuple(e / SPAN for e in r.lights.intensity[:2]), True)
+    few = replace(r, views=r.views[:2], light_names=r.light_names[:2], normal_maps=r.normal_maps[:2], lights=lights)
+    return SphereScene(few, replace(made.capture, views=tuple(map(as_read, views))))
+
+
+@pytest.fixture(scope="module")
+def folders(scene: SphereScene, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    base = tmp_path_factory.mktemp("render")
+    r = scene.reconstruction
+    named = [dict(zip(r.views, values, strict=True)) for values in (r.normal_maps, r.lights.direction, r.lights.intensity)]
+    write_capture(scene.capture, Truth(r.views, *named, r.surface), base / "capture")
+    write_reconstruction(r, base / "result")
+    return base / "result", base / "capture"
+
+
+def image(path: Path) -> np.ndarray:
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert stored is not None, path
+    return stored[..., ::-1] if stored.ndim == 3 else stored
+
+
+def test_the_photographs_come_out_again(scene: SphereScene, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    result, capture = folders
+    assert run(main, [str(result), "--capture", str(capture), "--views", "2", "--out", str(tmp_path / "out")]) == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["view_02"]
+    view = scene.capture.views[1]
+    for k, number in enumerate(view.lights):
+        rendered = image(tmp_path / "out" / "view_02" / f"{number:03d}.png")
+        assert rendered.dtype == np.uint16 and rendered.max() > 255
+        # Single precision and the rounding of the photograph.
+        assert np.abs(rendered[view.mask].astype(int) - view.samples[:, k]).max() <= 2
+        assert (rendered[~view.mask] == 0).all()
+    np.testing.assert_array_equal(image(tmp_path / "out" / "view_02" / "mask.png") == 255, view.mask)
+
+
+def test_all_views_of_the_result_without_views(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    result, capture = folders
+    assert run(main, [str(result), "--capture", str(capture), "--out", str(tmp_path / "out")]) == 0
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["view_01", "view_02"]
+    assert len(list((tmp_path / "out").rglob("0*.png"))) == 20
+
+
+def test_lights_keep_their_numbers(scene: SphereScene, folders: tuple[Path, Path], tmp_path: Path) -> None:
+    """A result of two of the lights: their images carry their numbers."""
+    r = scene.reconstruction
+    lights = Lights(tuple(d[[6, 8]] for d in r.lights.direction), tuple(e[[6, 8]] for e in r.lights.intensity), True)
+    write_reconstruction(replace(r, lights=lights, light_names=((7, 9), (7, 9))), tmp_path / "result")
+    assert run(main, [str(tmp_path / "result"), "--capture", str(folders[1]), "--views", "1", "--out", str(tmp_path / "out")]) == 0
+    names = sorted(p.name for p in (tmp_path / "out" / "view_01").iterdir())
+    assert names == ["007.png", "009.png", "mask.png"]
+    rendered = image(tmp_path / "out" / "view_01" / "009.png")
+    view = scene.capture.views[0]
+    assert np.abs(rendered[view.mask].astype(int) - view.samples[:, 8]).max() <= 2
+
+
+def test_bright_pixels_are_clipped_and_chunks_join(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    r, camera = scene.reconstruction, scene.capture.views[0].camera
+    caster = RayCaster(r.surface)
+    whole, mask = render_view(caster, r, "view_01", camera)
+    monkeypatch.setattr(mvps.render, "SAMPLES_PER_CHUNK", 1000)
+    np.testing.assert_array_equal(render_view(caster, r, "view_01", camera)[0], whole)
+    bright = replace(r, material=replace(r.material, albedo=r.material.albedo * 100))
+    image, _ = render_view(caster, bright, "view_01", camera)
+    assert image.max() == 65535 and (image[~mask] == 0).all() and (image >= whole).all()
+
+
+def test_messages(folders: tuple[Path, Path], scene: SphereScene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    result, capture = folders
+
+    def complaint(*arguments: object) -> str:
+        assert run(main, [str(a) for a in arguments]) == 2
+        return capsys.readouterr().err
+
+    out = tmp_path / "out"
+    assert "wanted a result folder" in complaint(capture, "--capture", capture, "--out", out)
+    assert "wanted" in (missing := complaint(result, "--capture", capture, "--views", 3, "--out", out)) and "3" in missing
+    assert "wanted numbers from 1" in complaint(result, "--capture", capture, "--views", "x", "--out", out)
+    assert "--capture" in complaint(result, "--out", out)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "file").write_text("1")
+    assert "wanted a new or empty folder" in complaint(result, "--capture", capture, "--out", tmp_path / "mine")
+    renamed = replace(scene.reconstruction, views=("view_08", "view_09"))
+    write_reconstruction(renamed, tmp_path / "other")
+    assert "wanted the capture of the result's view_08, view_09" in complaint(tmp_path / "other", "--capture", capture, "--out", out)
+    given = complaint(tmp_path / "other", "--capture", capture, "--views", 1, "--out", out)
+    assert "views: wanted one of the result's view_08, view_09, given view_01" in given
+    assert not out.exists()
+    with pytest.raises(CaptureError, match="given view_05"):
+        render_view(RayCaster(scene.reconstruction.surface), scene.reconstruction, "view_05", scene.capture.views[0].camera)

@@ -1,0 +1,241 @@
+"""The page: it parses, needs nothing else, shows what the metrics hold and leaves out what they do not."""
+
+from __future__ import annotations
+
+import base64
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from sphere_scene import SphereScene, make_sphere
+
+import mvps.report.page
+from mvps.report import report_html, write_report
+from mvps.report.charts import light_sphere, line_chart
+from mvps.report.pictures import ERROR_SPAN, LARGEST_SIDE, view_pictures
+from mvps.scene import Capture, Lights
+from mvps.visibility import RayCaster
+
+METRICS: dict[str, Any] = {
+    "stages": [
+        {"name": "load", "seconds": 1.25, "peak_memory_mb": 812.5},
+        {"name": "joint", "seconds": 20.0, "peak_memory_mb": 1500.0, "status": "5 rounds"},
+    ],
+    "rounds": [
+        {"round": 1, "residual": 0.0321, "light_change_deg": 1.5, "normal_change_deg": 3.0, "vertex_change_px": 0.4},
+        {"round": 2, "residual": 0.0123},
+    ],
+    "status": {"name": "converged", "text": "the step fell below the tolerance"},
+    "model": {
+        "components": [{"name": "two lobes", "kept": True, "gain": 0.125, "seconds": 3.5, "why": "0.1 dB & more than its noise < 0.02"}]
+    },
+    "truth": {"chamfer_mm": 0.1875, "light_error_deg": 1.5},
+}
+SECTIONS = {
+    "stages": "Time and memory",
+    "rounds": "Rounds",
+    "model": "Reflectance model",
+    "truth": "Against ground truth",
+}
+
+
+class Page(HTMLParser):
+    """All tags with their attributes; complains where tags do not close in order."""
+
+    VOID = frozenset({"meta", "img", "br", "path", "circle", "polyline"})
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in self.VOID or (tag == "circle" and not self.rawdata[: self.rawdata.find(">")].endswith("/")):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    made = make_sphere(3)
+    return made._replace(reconstruction=replace(made.reconstruction, metrics=METRICS))
+
+
+@pytest.fixture(scope="module")
+def html(scene: SphereScene) -> str:
+    return report_html(scene.reconstruction, scene.capture)
+
+
+def words(html: str) -> str:
+    return " ".join(" ".join(Page(html).text).split())
+
+
+def test_the_page_needs_nothing_else(html: str) -> None:
+    page = Page(html)
+    assert not page.open
+    assert "http" not in html and "<script" not in html and "@import" not in html and "url(" not in html and "<link" not in html
+    assert all(image["src"].startswith("data:image/jpeg;base64,") for image in page.all("img"))  # type: ignore[union-attr]
+    assert len(html) < 15e6
+    assert any(meta.get("name") == "viewport" for meta in page.all("meta"))
+
+
+def test_every_picture_has_words_and_decodes(html: str) -> None:
+    page = Page(html)
+    images = page.all("img")
+    assert len(images) == 4 * 7
+    for image in images:
+        assert image["alt"] and len(image["alt"]) > 10
+        data = base64.b64decode((image["src"] or "").partition(",")[2])
+        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert decoded.shape[:2] == (int(image["height"] or 0), int(image["width"] or 0)) and max(decoded.shape) <= LARGEST_SIDE
+    assert all(drawing.get("aria-label") for drawing in page.all("svg"))
+
+
+def test_views_are_spread(html: str) -> None:
+    assert re.findall(r"<h3>(view_\d+), light \d+</h3>", html) == ["view_01", "view_02", "view_04", "view_05"]
+
+
+def test_numbers_are_shown(html: str) -> None:
+    text = words(html)
+    for shown in (
+        *(
+            "converged: the step fell below the tolerance",
+            "21.2 s in all",
+            "load 1.25",
+            "20 1500 5 rounds",
+            "0.0321",
+            "0.0123",
+            "two lobes yes",
+        ),
+        *(
+            "0.125",
+            "0.1 dB & more than its noise < 0.02",
+            "chamfer mm 0.1875",
+            "light error deg 1.5",
+            '"preset": "standard"',
+            "60 photographs",
+        ),
+        *("Views", "Lights", "Settings", *SECTIONS.values()),
+    ):
+        assert shown in text.replace("  ", " "), shown
+
+
+@pytest.mark.parametrize("missing", SECTIONS)
+def test_what_is_missing_is_left_out(scene: SphereScene, missing: str) -> None:
+    metrics = {key: value for key, value in METRICS.items() if key != missing}
+    text = words(report_html(replace(scene.reconstruction, metrics=metrics), scene.capture))
+    assert SECTIONS[missing] not in text
+    assert all(title in text for key, title in SECTIONS.items() if key != missing)
+
+
+@pytest.mark.parametrize(
+    "metrics",
+    [
+        {},
+        {"stages": [], "rounds": [], "status": {}, "model": {}, "truth": {}},
+        {
+            "stages": [{"name": "load"}],
+            "rounds": [{"round": 1}],
+            "status": {"name": "stopped"},
+            "model": {"components": [{"name": "Lambert"}]},
+        },
+        {"stages": [{"name": "load", "seconds": 0}], "truth": {"per view": [1, 2], "good": None}},
+    ],
+)
+def test_sparse_metrics_make_a_page(scene: SphereScene, metrics: dict[str, Any]) -> None:
+    page = Page(report_html(replace(scene.reconstruction, metrics=metrics, settings={}), scene.capture))
+    assert not page.open and "Settings" not in " ".join(page.text)
+
+
+def test_texts_are_escaped(scene: SphereScene) -> None:
+    evil = '<img src=x onerror="alert(1)">'
+    metrics = {"status": {"name": evil}, "stages": [{"name": evil, "seconds": 1.0, "status": evil}], "truth": {evil: evil}}
+    changed = replace(scene.reconstruction, metrics=metrics, settings={evil: evil})
+    html = report_html(changed, Capture(evil, scene.capture.views))
+    assert evil not in html and all("onerror" not in image for image in Page(html).all("img"))
+
+
+def test_views_and_lights_that_the_result_lacks_are_not_shown(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    fewer = replace(
+        r,
+        views=r.views[:1],
+        light_names=((7, 9),),
+        normal_maps=r.normal_maps[:1],
+        lights=Lights((r.lights.direction[0][[6, 8]],), (r.lights.intensity[0][[6, 8]],), False),
+    )
+    html = report_html(fewer, scene.capture)
+    assert re.findall(r"<h3>(.*?)</h3>", html) in (["view_01, light 7"], ["view_01, light 9"])
+    none = report_html(fewer, Capture("others", scene.capture.views[1:]))
+    assert "<img" not in none and "Views" not in words(none) and "Lights" not in words(none)
+
+
+def test_pictures_show_what_they_say(scene: SphereScene) -> None:
+    """Photographs by the same image model: the error is black, the photograph and the re-rendering agree."""
+    light, pictures = view_pictures(RayCaster(scene.reconstruction.surface), scene.reconstruction, scene.capture.views[4])
+    by_title = {picture.title: picture for picture in pictures}
+    assert light.startswith("light ") and len(by_title) == 7
+    error = by_title[f"error, white = {100 * ERROR_SPAN:.0f} %"]
+    assert "mean absolute error 0.0 % of white" in error.text
+    difference = by_title["photograph"].image.astype(int) - by_title["re-rendering"].image
+    assert np.abs(difference).max() <= 2
+    middle = tuple(s // 2 for s in error.image.shape[:2])
+    assert by_title["normals"].image[middle][2] > 240 and (by_title["shadow"].image[middle] == 255).all()
+    assert (error.image[middle] <= 1).all()
+    wrong = replace(scene.reconstruction, material=replace(scene.reconstruction.material, albedo=scene.reconstruction.material.albedo * 3))
+    _, pictures = view_pictures(RayCaster(wrong.surface), wrong, scene.capture.views[4])
+    assert pictures[2].image[middle].max() == 255
+
+
+def test_chart_draws_the_values() -> None:
+    html = line_chart([4.0, 2.0, 1.0], "round", "residual")
+    points = [tuple(map(float, p.split(","))) for p in re.findall(r'points="(.*?)"', html)[0].split()]
+    heights = [y for _, y in points]
+    base = 12 + (4.0 / 4.0) * (heights[0] - 12) if heights[0] > 12 else 12
+    assert base == 12 and heights[0] < heights[1] < heights[2]
+    # Zero lies on the axis, so heights above it are in proportion to the values.
+    zero = 2 * heights[1] - heights[0]
+    assert (zero - heights[2]) / (zero - heights[0]) == pytest.approx(0.25, abs=0.01)
+    for values in ([1.0], [0.0, 0.0], [-1.0, 1.0]):
+        assert not Page(line_chart(values, "a", "b")).open
+
+
+def test_lights_lie_where_the_camera_sees_them() -> None:
+    direction = np.array([[0.6, 0, 0.8], [0, 0.6, 0.8], [0, 0, 1.0], [1, 0, 0], [0, -0.6, -0.8]])
+    html = light_sphere(direction, np.ones((5, 3)), (1, 2, 3, 4, 5), "view_01")
+    marks = {re.findall(r"light (\d)", m)[0]: m for m in re.findall(r'<circle class="light".*?</circle>', html)}
+    assert 'cx="60.0" cy="-0.0"' in marks["1"] and 'cx="0.0" cy="-60.0"' in marks["2"] and "37 degrees" in marks["2"]
+    assert 'fill="none"' in marks["5"] and 'fill="none"' not in marks["4"]
+
+
+def test_write_is_whole_and_repeatable(scene: SphereScene, html: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_report(scene.reconstruction, scene.capture, tmp_path / "report.html")
+    assert (tmp_path / "report.html").read_text(encoding="utf-8") == html
+
+    def fails(*_: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mvps.report.page, "report_html", fails)
+    with pytest.raises(KeyboardInterrupt):
+        write_report(scene.reconstruction, scene.capture, tmp_path / "report.html")
+    assert list(tmp_path.iterdir()) == [tmp_path / "report.html"] and (tmp_path / "report.html").read_text(encoding="utf-8") == html

@@ -1,0 +1,405 @@
+"""Atlas, baking and the physically based material: laws of the charts, known colours, normals and roughness."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from sphere_scene import RADIUS, SphereScene, colours, make_sphere
+
+from mvps.atlas import AXES, PADDING, STEEPEST, Atlas, build_atlas, padded, rasterise, vertex_tangents
+from mvps.gltf import glb_bytes
+from mvps.mesh import face_areas, face_normals, normalise, vertex_normals
+from mvps.pbr import linear_from_srgb, reflectance_scale, roughness, specular_energy, srgb_bytes
+from mvps.rendering import photograph
+from mvps.scene import Capture, Lights, Material, Surface, View
+from mvps.texture import Textures, _robust_albedo, bake, pixel_albedo, png_bytes
+from mvps.visibility import RayCaster
+
+
+def surface_of(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+def spring() -> Surface:
+    """A tube around a helix: every projection along the helix' axis covers itself."""
+    angle, around = np.meshgrid(np.linspace(0, 6 * np.pi, 160), np.linspace(0, 2 * np.pi, 12, endpoint=False), indexing="ij")
+    radius = 10 + 2 * np.cos(around)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 2 * angle + 2 * np.sin(around)], -1).reshape(-1, 3)
+    i, j = np.meshgrid(np.arange(159), np.arange(12), indexing="ij")
+    a, b, c, d = i * 12 + j, (i + 1) * 12 + j, i * 12 + (j + 1) % 12, (i + 1) * 12 + (j + 1) % 12
+    return Surface(points, np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([b, d, c], -1).reshape(-1, 3)]))
+
+
+def crossed() -> Surface:
+    """Two sheets that pass through each other and share one edge: each is above the other somewhere."""
+    x, y = np.meshgrid(np.arange(-10.0, 11), np.arange(-10.0, 11), indexing="ij")
+    i, j = np.meshgrid(np.arange(20), np.arange(20), indexing="ij")
+    a = i * 21 + j
+    faces = np.concatenate([np.stack([a, a + 21, a + 1], -1).reshape(-1, 3), np.stack([a + 21, a + 22, a + 1], -1).reshape(-1, 3)])
+    sheets = [np.stack([x, y, slope * x], -1).reshape(-1, 3) for slope in (0.3, -0.3)]
+    joined = faces + 441
+    # The sheets meet along x = 0 in space; joining those vertices makes them one component.
+    middle = 10 * 21 + np.arange(21)
+    renamed = np.arange(882)
+    renamed[middle + 441] = middle
+    return Surface(np.concatenate(sheets), np.concatenate([faces, renamed[joined]]))
+
+
+SHAPES = {
+    "ball": surface_of(trimesh.creation.icosphere(subdivisions=4, radius=20)),
+    "box": surface_of(trimesh.creation.box((20, 30, 5))),
+    "ring": surface_of(trimesh.creation.torus(20, 6, major_sections=64, minor_sections=24)),
+    "spring": spring(),
+    "crossed": crossed(),
+    "triangle": Surface(np.array([[0.0, 0, 0], [30, 0, 0], [0, 20, 5]]), np.array([[0, 1, 2]])),
+    "with a flat face": Surface(np.array([[0.0, 0, 0], [30, 0, 0], [0, 20, 0], [15, 0, 0]]), np.array([[0, 1, 2], [0, 3, 1]])),
+}
+
+
+@pytest.fixture(params=SHAPES)
+def shape(request: pytest.FixtureRequest) -> Surface:
+    return SHAPES[request.param]
+
+
+def on_texels(atlas: Atlas) -> np.ndarray:
+    return (atlas.uv * (atlas.width, atlas.height))[atlas.faces]
+
+
+def test_an_atlas_is_the_same_surface(shape: Surface) -> None:
+    atlas = build_atlas(shape, 0.5)
+    np.testing.assert_array_equal(atlas.vertex[atlas.faces], shape.faces)
+    assert (atlas.uv > 0).all() and (atlas.uv < 1).all()
+
+
+def test_charts_are_projections_and_never_mirrored(shape: Surface) -> None:
+    """A face's area on the atlas, in texels, is its projected area: cosine to the axis times area, positive in the order of its corners."""
+    texel = 0.5
+    atlas = build_atlas(shape, texel)
+    a, b, c = np.moveaxis(on_texels(atlas), 1, 0)
+    u, v = b - a, c - a
+    # v grows downwards, so a counter-clockwise face runs clockwise in (u, v).
+    on_atlas = -(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+    share = on_atlas * texel**2 / np.maximum(face_areas(shape), 1e-12)
+    solid = face_areas(shape) > 1e-9
+    assert share[solid].min() > STEEPEST - 1e-6 and share.max() < 1 + 1e-6
+    assert (share[solid] > 0.8 * (face_normals(shape) @ AXES.T).max(1)[solid] - 0.55).all()
+
+
+def test_no_texel_has_two_owners(shape: Surface) -> None:
+    """Slow twin of the rasteriser: count, face by face, the texel centres strictly inside."""
+    atlas = build_atlas(shape, 0.5)
+    count = np.zeros((atlas.height, atlas.width), int)
+    for corners in on_texels(atlas):
+        low, high = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
+        x, y = np.meshgrid(np.arange(low[0], high[0]) + 0.5, np.arange(low[1], high[1]) + 0.5)
+        sides = []
+        for k in range(3):
+            p, q = corners[k], corners[(k + 1) % 3]
+            sides.append((q[0] - p[0]) * (y - p[1]) - (q[1] - p[1]) * (x - p[0]))
+        inside = (np.array(sides) < -1e-6).all(0)
+        count[low[1] : high[1], low[0] : high[0]] += inside
+    assert count.max() == 1
+    owned = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
+    filled = np.zeros_like(count)
+    filled[owned.row, owned.column] += 1
+    assert filled.max() == 1 and (filled >= count).all()
+
+
+def test_texels_lie_where_their_face_says(shape: Surface) -> None:
+    atlas = build_atlas(shape, 0.5)
+    t = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
+    uv = (atlas.uv[atlas.faces[t.face]] * t.barycentric[..., None]).sum(1)
+    np.testing.assert_allclose(uv * (atlas.width, atlas.height), np.stack([t.column, t.row], -1) + 0.5, atol=1e-5)
+
+
+def test_charts_keep_their_distance() -> None:
+    """No two charts come nearer than the padding."""
+    atlas = build_atlas(SHAPES["spring"], 0.5)
+    t = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
+    owner = np.full((atlas.height, atlas.width), -1)
+    owner[t.row, t.column] = atlas.chart[t.face]
+    for shift in [(0, k) for k in range(1, PADDING)] + [(k, 0) for k in range(1, PADDING)]:
+        moved = np.roll(owner, shift, (0, 1))
+        assert ((owner == moved) | (owner < 0) | (moved < 0)).all()
+
+
+def test_texel_size_scales_with_the_world() -> None:
+    small = build_atlas(SHAPES["ring"], 0.5)
+    large = build_atlas(Surface(SHAPES["ring"].vertices * 1024, SHAPES["ring"].faces), 512.0)
+    assert (small.height, small.width) == (large.height, large.width)
+    np.testing.assert_allclose(small.uv, large.uv, atol=1e-9)
+    with pytest.raises(ValueError, match="texel: wanted a positive length in world units, given 0"):
+        build_atlas(SHAPES["ring"], 0)
+
+
+def test_tangents_follow_u() -> None:
+    """The tangent is the direction in which u grows on the surface, made perpendicular to the normal."""
+    shape = SHAPES["ring"]
+    atlas = build_atlas(shape, 0.5)
+    normal = vertex_normals(shape)
+    tangent = vertex_tangents(atlas, normal)
+    np.testing.assert_allclose((tangent * normal[atlas.vertex]).sum(-1), 0, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(tangent, axis=-1), 1)
+    x, uv = shape.vertices[shape.faces], on_texels(atlas)
+    du, dx = uv[:, 1:] - uv[:, :1], x[:, 1:] - x[:, :1]
+    along_u, along_v = np.moveaxis(np.linalg.solve(du, dx), 1, 0)
+    faces = atlas.faces[:, 0]
+    assert ((tangent[faces] * along_u).sum(-1) > 0).all()
+    # glTF: the bitangent normal x tangent points up in the image.
+    assert ((np.cross(normal[atlas.vertex], tangent)[faces] * along_v).sum(-1) < 0).all()
+
+
+def test_a_normal_along_the_tangent_still_has_one() -> None:
+    shape = SHAPES["triangle"]
+    atlas = build_atlas(shape, 0.5)
+    normal = atlas.tangent[np.argsort(atlas.vertex)]
+    tangent = vertex_tangents(atlas, normal)
+    np.testing.assert_allclose(np.linalg.norm(tangent, axis=-1), 1)
+    np.testing.assert_allclose((tangent * normal[atlas.vertex]).sum(-1), 0, atol=1e-9)
+
+
+def test_padding_repeats_the_nearest_texel() -> None:
+    image, filled = np.zeros((1, 20), np.uint8), np.zeros((1, 20), bool)
+    image[0, 5], filled[0, 5] = 7, True
+    expected = np.where(np.abs(np.arange(20) - 5) <= PADDING, 7, 0)
+    np.testing.assert_array_equal(padded(image, filled)[0], expected)
+
+
+# ------------------------------------------------------------------------------------------------ material
+
+
+@given(st.floats(0.1, 0.95), st.floats(0.01, 3.0))
+def test_roughness_and_strength_of_one_lobe(rough: float, weight: float) -> None:
+    """alpha = roughness^2, s = 2 / alpha^2; the peak F0 / (4 alpha^2) is the lobe's weight."""
+    s = 2 / rough**4
+    assert roughness(np.array([[weight]]), np.array([s]))[0] == pytest.approx(rough)
+    assert specular_energy(np.array([[weight]]), np.array([s]))[0] / (4 * rough**4) == pytest.approx([weight] * 3)
+
+
+def test_ggx_has_the_peak_and_the_integral_of_the_lobes() -> None:
+    """By quadrature: the lobes over half vectors against F0 pi D / 4 times the cosine, both over the hemisphere."""
+    weight, sharpness = np.array([[0.4, 0.7]]), np.array([40.0, 300.0])
+    alpha = roughness(weight, sharpness)[0] ** 2
+    f0 = specular_energy(weight, sharpness)[0, 0]
+    theta = np.linspace(0, np.pi / 2, 200001)
+    cos, sin = np.cos(theta), np.sin(theta)
+    lobes = np.exp(sharpness * (cos[:, None] - 1)) @ weight[0]
+    ggx = f0 / 4 * alpha**2 / (cos**2 * (alpha**2 - 1) + 1) ** 2
+    assert ggx[0] == pytest.approx(lobes[0])
+    assert np.trapezoid(ggx * cos * sin, theta) == pytest.approx(np.trapezoid(lobes * sin, theta), rel=1e-3)
+
+
+def test_no_gloss_is_rough_and_broad_lobes_stay_in_range() -> None:
+    assert roughness(np.zeros((1, 2)), np.array([3.0, 30.0])) == 1
+    assert roughness(np.zeros((1, 0)), np.zeros(0)) == 1
+    assert roughness(np.ones((1, 1)), np.array([0.1])) == 1
+    assert 0 < roughness(np.ones((1, 1)), np.array([1e9]))[0] < 0.2
+
+
+def test_colour_weights_tint_the_reflection() -> None:
+    weight = np.array([[[1.0, 0.5, 0.25]]])
+    np.testing.assert_allclose(specular_energy(weight, np.array([16.0])), [[0.5, 0.25, 0.125]])
+    assert roughness(weight, np.array([16.0]))[0] == pytest.approx((2 / 16) ** 0.25)
+
+
+@given(st.floats(1e-6, 1e6))
+def test_exposure_does_not_change_the_colours(factor: float) -> None:
+    rng = np.random.default_rng(0)
+    n = 50
+    normal = np.tile([0.0, 0, 1], (n, 1))
+    a = Material(normal, rng.uniform(0, 1, (n, 3)), rng.uniform(0, 1, (n, 1)), np.array([20.0]), np.ones(n))
+    b = replace(a, albedo=a.albedo * factor, specular_weight=a.specular_weight * factor)
+    assert reflectance_scale(b) == pytest.approx(factor * reflectance_scale(a))
+    black = replace(a, albedo=np.zeros((n, 3)), specular_weight=np.zeros((n, 1)))
+    assert reflectance_scale(black) == 1
+
+
+def test_srgb_round_trip_and_known_values() -> None:
+    codes = np.arange(256, dtype=np.uint8)
+    np.testing.assert_array_equal(srgb_bytes(linear_from_srgb(codes)), codes)
+    # IEC 61966-2-1: middle grey of 18 % and 21.4 %; out of range is clipped.
+    np.testing.assert_array_equal(srgb_bytes(np.array([-1, 0, 0.18, 0.214041, 1, 7])), [0, 0, 118, 127, 255, 255])
+
+
+# ------------------------------------------------------------------------------------------------ baking
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    return make_sphere()
+
+
+@pytest.fixture(scope="module")
+def baked(scene: SphereScene) -> Textures:
+    """From a material whose albedo is grey: the colours can only come from the photographs."""
+    r = scene.reconstruction
+    grey = replace(r.material, albedo=np.full_like(r.material.albedo, 0.6))
+    return bake(r.surface, grey, r.lights, scene.capture)
+
+
+def texel_positions(scene: SphereScene, atlas: Atlas) -> tuple[np.ndarray, ...]:
+    t = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
+    corners = scene.reconstruction.surface.vertices[scene.reconstruction.surface.faces[t.face]]
+    return t.row, t.column, (corners * t.barycentric[..., None]).sum(1)
+
+
+def test_base_colour_comes_from_the_photographs(scene: SphereScene, baked: Textures) -> None:
+    row, column, position = texel_positions(scene, baked.atlas)
+    colour = linear_from_srgb(baked.base_color[row, column]) * baked.scale
+    # Two pixels (2 x 1 mm) around the border of the colours may be mixed.
+    clear = np.abs(position[:, 0]) > 2.5
+    error = np.abs(colour - colours(position))[clear].max(1)
+    assert baked.from_photographs == 1
+    assert np.median(error) < 0.01 and np.percentile(error, 99) < 0.05
+
+
+def test_texels_without_a_photograph_keep_the_vertices_albedo(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    one = Capture("one", scene.capture.views[:1])
+    lights = Lights(r.lights.direction[:1], r.lights.intensity[:1], True)
+    grey = replace(r.material, albedo=np.full_like(r.material.albedo, 0.6))
+    textures = bake(r.surface, grey, lights, one)
+    row, column, position = texel_positions(scene, textures.atlas)
+    colour = linear_from_srgb(textures.base_color[row, column]) * textures.scale
+    np.testing.assert_allclose(colour[position[:, 0] < 0], 0.6, atol=0.01)
+    assert np.median(np.abs(colour - RIGHT_SIDE)[position[:, 0] > 0.5 * RADIUS]) < 0.01
+    assert 0.2 < textures.from_photographs < 0.5
+
+
+RIGHT_SIDE = colours(np.array([1.0, 0, 0]))
+
+
+def test_a_hidden_part_takes_no_colour_from_what_hides_it() -> None:
+    """A small ball in front of the large one: where it hides the large one, the view says nothing of that."""
+    scene = make_sphere(3)
+    r = scene.reconstruction
+    small = trimesh.creation.icosphere(subdivisions=3, radius=8)
+    n, m = len(r.surface.vertices), len(small.vertices)
+    surface = Surface(
+        np.concatenate([r.surface.vertices, small.vertices + np.array([60, 0, 0])]),
+        np.concatenate([r.surface.faces, np.array(small.faces) + n]),
+    )
+    albedo = np.concatenate([np.full((n, 3), 0.6), np.full((m, 3), 0.3)])
+    material = Material(vertex_normals(surface), albedo, np.zeros((n + m, 0)), np.zeros(0), np.ones(n + m))
+    view = scene.capture.views[0]
+    lights = Lights(r.lights.direction[:1], r.lights.intensity[:1], True)
+    radiance = photograph(RayCaster(surface), material, view.camera, view.pixels, lights.direction[0], lights.intensity[0], 1.0)
+    samples = np.rint(radiance / 2 * 65535).astype(np.uint16)
+    wrong = replace(material, albedo=np.full_like(albedo, 0.1))
+    textures = bake(surface, wrong, lights, Capture("two", (replace(view, samples=samples),)))
+    t = rasterise(textures.atlas.uv, textures.atlas.faces, textures.atlas.height, textures.atlas.width)
+    x = (surface.vertices[surface.faces[t.face]] * t.barycentric[..., None]).sum(1)
+    colour = (linear_from_srgb(textures.base_color[t.row, t.column]) * textures.scale).mean(1)
+    big = np.linalg.norm(x, axis=1) < RADIUS + 1
+    behind = big & (np.linalg.norm(x[:, 1:], axis=1) < 6) & (x[:, 0] > 0)
+    beside = big & (np.linalg.norm(x[:, 1:], axis=1) > 12) & (x[:, 0] > 0.7 * RADIUS)
+    front = ~big & (x[:, 0] > 65)
+    assert min(behind.sum(), beside.sum(), front.sum()) > 100
+    np.testing.assert_allclose(colour[behind], 0.1, atol=0.01)
+    assert np.median(np.abs(colour[beside] - 0.6)) < 0.02 and np.median(np.abs(colour[front] - 0.3)) < 0.02
+
+
+def glb_parts(data: bytes) -> tuple[dict[str, object], dict[str, np.ndarray]]:
+    """The JSON and the arrays of a GLB file, read by its specification."""
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert kind == b"JSON"
+    document = json.loads(data[20 : 20 + size])
+    binary = data[28 + size :]
+    arrays = {}
+    primitive = document["meshes"][0]["primitives"][0]
+    for name, k in [*primitive["attributes"].items(), ("indices", primitive["indices"])]:
+        accessor = document["accessors"][k]
+        columns = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        kind = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
+        start = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        arrays[name] = np.frombuffer(binary, kind, accessor["count"] * columns, start).reshape(-1, columns)
+    return document, arrays
+
+
+def test_normal_map_decodes_to_the_refined_normals(scene: SphereScene, baked: Textures) -> None:
+    """As a viewer does it, from the GLB alone: interpolate NORMAL and TANGENT, bitangent = cross(n, t) w, decode 2 c / 255 - 1."""
+    surface = scene.reconstruction.surface
+    _, arrays = glb_parts(glb_bytes(surface.vertices, baked))
+    faces = arrays["indices"].reshape(-1, 3).astype(int)
+    t = rasterise(arrays["TEXCOORD_0"].astype(float), faces, baked.atlas.height, baked.atlas.width)
+    n, tangent = (normalise((arrays[k][faces[t.face], :3].astype(float) * t.barycentric[..., None]).sum(1)) for k in ("NORMAL", "TANGENT"))
+    assert (arrays["TANGENT"][:, 3] == 1).all()
+    x, y, z = np.moveaxis(baked.normal_map[t.row, t.column] / 127.5 - 1, -1, 0)[..., None]
+    decoded = normalise(x * tangent + y * normalise(np.cross(n, tangent)) + z * n)
+    expected = normalise((scene.reconstruction.material.normal[surface.faces[t.face]] * t.barycentric[..., None]).sum(1))
+    angle = np.degrees(np.arccos(np.clip((decoded * expected).sum(1), -1, 1)))
+    assert angle.max() < 1
+    plain = np.degrees(np.arccos(np.clip((n * expected).sum(1), -1, 1)))
+    assert plain.max() > 5
+
+
+def test_roughness_and_specular_textures(scene: SphereScene, baked: Textures) -> None:
+    row, column, _ = texel_positions(scene, baked.atlas)
+    material = scene.reconstruction.material
+    expected = roughness(material.specular_weight[:1], material.sharpness)[0]
+    np.testing.assert_allclose(baked.roughness[row, column] / 255, expected, atol=0.5 / 255)
+    f0 = linear_from_srgb(baked.specular_color[row, column]) * baked.specular_level
+    expected_f0 = specular_energy(material.specular_weight[:1], material.sharpness) / baked.scale
+    assert np.abs(f0 / expected_f0 - 1).max() < 0.01
+    document, _ = glb_parts(glb_bytes(scene.reconstruction.surface.vertices, baked))
+    extension = document["materials"][0]["extensions"]["KHR_materials_specular"]  # type: ignore[index]
+    assert extension["specularColorFactor"][0] * 0.04 == pytest.approx(baked.specular_level)
+
+
+def test_a_matt_surface_says_so(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    n = len(r.material.albedo)
+    matt = replace(r.material, specular_weight=np.zeros((n, 0)), sharpness=np.zeros(0))
+    textures = bake(r.surface, matt, r.lights, scene.capture)
+    document, _ = glb_parts(glb_bytes(r.surface.vertices, textures))
+    material = document["materials"][0]  # type: ignore[index]
+    assert material["extensions"]["KHR_materials_specular"] == {"specularFactor": 0.0}
+    assert material["extras"]["albedo_scale"] == textures.scale
+
+
+def test_saturated_samples_and_outliers_do_not_count(scene: SphereScene) -> None:
+    """A third of the samples of every pixel saturated, one more of them wrong: the albedo is still right."""
+    r, view = scene.reconstruction, scene.capture.views[0]
+    samples = view.samples.copy()
+    samples[:, ::3] = 65535
+    samples[:, 1] = 30000
+    changed: View = replace(view, samples=samples)
+    caster = RayCaster(r.surface)
+    hit, albedo, known = pixel_albedo(caster, r.material, changed, r.lights.direction[0], r.lights.intensity[0], 1.0)
+    frontal = known & (hit[:, 0] > 0.7 * RADIUS)
+    assert frontal.sum() > 1000
+    assert np.median(np.abs(albedo[frontal] - RIGHT_SIDE)) < 0.01
+    nothing = replace(view, samples=np.full_like(samples, 65535))
+    assert not pixel_albedo(caster, r.material, nothing, r.lights.direction[0], r.lights.intensity[0], 1.0)[2].any()
+
+
+@given(st.integers(0, 1000))
+def test_a_minority_of_outliers_is_ignored(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    diffuse = rng.uniform(0.2, 1, (4, 12, 3)).astype(np.float32)
+    truth = rng.uniform(0.1, 1, (4, 3)).astype(np.float32)
+    measured = truth[:, None] * diffuse
+    usable = np.ones((4, 12), bool)
+    measured[:, :2] += 0.5
+    usable[:, 5], measured[:, 5] = False, 9
+    np.testing.assert_allclose(_robust_albedo(measured, diffuse, usable), truth, rtol=0.05, atol=0.02)
+    assert (_robust_albedo(measured, diffuse, np.zeros_like(usable)) == 0).all()
+
+
+def test_messages(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    few = Lights(r.lights.direction[:2], r.lights.intensity[:2], True)
+    with pytest.raises(ValueError, match=r"lights: wanted one per photograph of every view \(\[10, 10, .*given \[10, 10\]"):
+        bake(r.surface, r.material, few, scene.capture)
+    for image in (np.zeros((2, 2, 4), np.uint8), np.zeros((2, 2), np.int64), np.zeros((0, 2), np.uint8)):
+        with pytest.raises(ValueError, match="image: wanted"):
+            png_bytes(image)
