@@ -1,15 +1,18 @@
 """Colour: albedo per channel and the lights' colours, once normals, weights and grey intensities are known.
 
-    radiance_c / (e r_c) = a_c q_0 + sum_k w_k q_0 E_k,      q_0 = max(n.l, 0),   e mean intensity, r_c ratio of channel c
+A light's colour r (mean 1 over its channels) is what is left when the vertex's own colour g is taken out, where the diffuse part d of the
+grey prediction P outweighs the lobes (they may have the light's colour, the albedo's, or neither):
 
-is linear in a_c for given ratios and in r_c for given albedos; both are robust ratios of sums, taken in turn. One light's ratios
-are free up to a common factor per channel, which the albedo takes up: ratios have mean one over the lights.
+    radiance_c / e = g_c r_c P,     weights (d / P)^2 on top of the robust ones
+
+is linear in g and in r, which are solved in turn as robust ratios of sums. One factor per channel is free: r has mean one over the lights.
+With r known, the albedo of a channel is linear too:  radiance_c / (e r_c) = a_c q + sum_k w_k q E_k,   q = max(n.l, 0).
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,6 +27,17 @@ COLOUR_SWEEPS = 3
 PAIRS_PER_CHUNK = 2048
 
 
+class _Sums(NamedTuple):
+    """Numerators and denominators: of a vertex's colour and albedo, per pair (n, 3) and (n,); of a light's colour (lights, 3)."""
+
+    colour: Float
+    colour_weight: Float
+    albedo: Float
+    albedo_weight: Float
+    light: Float
+    light_weight: Float
+
+
 def _sums(
     view: View,
     samples: ViewSamples,
@@ -32,30 +46,29 @@ def _sums(
     lights: DirectionalLights,
     sharpness: torch.Tensor,
     ratio: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Per pair numerator (n, 3) and denominator (n,) of the albedo; per light numerator and denominator (lights, 3) of the ratios."""
+    colour: NDArray[np.float32],
+) -> _Sums:
     n, count = len(samples.vertex), len(ratio)
-    top, bottom = np.zeros((n, 3)), np.zeros(n)
-    light_top, light_bottom = np.zeros((count, 3)), np.zeros((count, 3))
-    # Rows of reflectance with the albedo set to zero shade the lobes alone.
-    bare = vertices.reflectance.clone()
-    bare[:, 0] = 0
+    out = _Sums(np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((count, 3)), np.zeros((count, 3)))
     for start in range(0, n, PAIRS_PER_CHUNK):
         part = slice(start, start + PAIRS_PER_CHUNK)
         index, towards = samples.vertex[part], samples.towards[part]
-        full = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, sharpness)
-        lobes = evaluate(vertices.normal[index], bare[index], towards, lights, sharpness).predicted.numpy()
-        weight = samples.weight[part, None] * samples.data[part] * robust(full.predicted - samples.image[part], vertices.scale[index])
-        w, q = weight.numpy(), full.basis[0].numpy()
-        positions, weights = bilinear(view.pixel_index, project(view.camera, surface.vertices[index.numpy()])[0])
+        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, sharpness)
+        weight = samples.weight[part, None] * samples.data[part] * robust(shaded.predicted - samples.image[part], vertices.scale[index])
+        w, q, predicted = (t.cpu().numpy() for t in (weight, shaded.basis[0], shaded.predicted))
+        diffuse = q * vertices.reflectance[index, :1].cpu().numpy()
+        body = w * (diffuse / np.maximum(predicted, 1e-12)) ** 2
+        rows = index.cpu().numpy()
+        positions, weights = bilinear(view.pixel_index, project(view.camera, surface.vertices[rows])[0])
         image = np.einsum("pklc,pk->plc", view.samples[positions].astype(np.float32) * np.float32(view.scale), weights)
-        top[part] = np.einsum("pl,plc->pc", w * q, image / ratio) - (w * q * lobes).sum(1)[:, None]
-        bottom[part] = (w * q * q).sum(1)
-        predicted = q[..., None] * albedo[index.numpy()][:, None] + lobes[..., None]
-        light_top += np.einsum("pl,plc,plc->lc", w, image, predicted)
-        light_bottom += np.einsum("pl,plc->lc", w, predicted**2)
-    return top, bottom, light_top, light_bottom
+        white = image / ratio
+        out.colour[part] = np.einsum("pl,plc->pc", body * predicted, white)
+        out.colour_weight[part] = (body * predicted**2).sum(1)
+        out.albedo[part] = np.einsum("pl,plc->pc", w * q, white) - (w * q * (predicted - diffuse)).sum(1)[:, None]
+        out.albedo_weight[part] = (w * q * q).sum(1)
+        out.light[:] += np.einsum("pl,plc,pc->lc", body * predicted, image, colour[rows])
+        out.light_weight[:] += np.einsum("pl,pc->lc", body * predicted**2, colour[rows] ** 2)
+    return out
 
 
 def colours(
@@ -68,30 +81,34 @@ def colours(
     ratios: list[Float],
     one_rig: bool,
 ) -> tuple[NDArray[np.float64], list[Float]]:
-    """Albedo (V, 3), NaN where no view sees the vertex, and per view the lights' channel ratios (lights, 3).
+    """Albedo (V, 3), NaN where no view sees the vertex, and per view the lights' channel ratios (lights, 3). Starts from `ratios`."""
+    colour = np.ones((len(vertices.normal), 3), np.float32)
 
-    Starts from `ratios`; the mean over the channels of albedo and ratio stays what the grey solution says.
-    """
-    grey = vertices.reflectance[:, :1].numpy()
-    albedo = np.repeat(grey, 3, 1)
-    host = replace(vertices)
-    for _ in range(COLOUR_SWEEPS):
+    def gather(now: NDArray[np.float32]) -> list[_Sums]:
         tasks = list(zip(capture.views, views, lights, ratios, strict=True))
         with ThreadPoolExecutor(WORKERS) as pool:
-            now = albedo
-            sums = list(pool.map(lambda t: _sums(t[0], t[1], surface, host, t[2], sharpness, t[3].astype(np.float32), now), tasks))
-        top, bottom = np.zeros((len(grey), 3)), np.zeros(len(grey))
-        for samples, part in zip(views, sums, strict=True):
-            top[samples.vertex.numpy()] += part[0]
-            bottom[samples.vertex.numpy()] += part[1]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            albedo = np.where(bottom[:, None] > 0, np.maximum(top / bottom[:, None], 0), np.nan)
-        albedo = np.nan_to_num(albedo, nan=0.0).astype(np.float32)
-        ratios = _ratios([(part[2], part[3]) for part in sums], one_rig)
+            return list(pool.map(lambda t: _sums(t[0], t[1], surface, vertices, t[2], sharpness, t[3].astype(np.float32), now), tasks))
+
+    for _ in range(COLOUR_SWEEPS):
+        sums = gather(colour)
+        top, bottom = _over_views(views, [(s.colour, s.colour_weight) for s in sums], len(colour))
+        colour = (top / np.maximum(bottom, 1e-12)[:, None]).astype(np.float32)
+        ratios = _ratios([(s.light, s.light_weight) for s in gather(colour)], one_rig)
+    top, bottom = _over_views(views, [(s.albedo, s.albedo_weight) for s in gather(colour)], len(colour))
+    albedo = np.full((len(colour), 3), np.nan)
     known = bottom > 0
-    result = np.full((len(grey), 3), np.nan)
-    result[known] = albedo[known]
-    return result, ratios
+    albedo[known] = np.maximum(top[known] / bottom[known, None], 0)
+    return albedo, ratios
+
+
+def _over_views(views: list[ViewSamples], sums: list[tuple[Float, Float]], vertices: int) -> tuple[Float, Float]:
+    """Sums of pairs added up per vertex: (V, 3) and (V,)."""
+    top, bottom = np.zeros((vertices, 3)), np.zeros(vertices)
+    for samples, (numerator, denominator) in zip(views, sums, strict=True):
+        index = samples.vertex.cpu().numpy()
+        top[index] += numerator
+        bottom[index] += denominator
+    return top, bottom
 
 
 def _ratios(sums: list[tuple[Float, Float]], one_rig: bool) -> list[Float]:
