@@ -168,8 +168,12 @@ def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: R
     return Lights(direction, intensity, refined.lights.one_rig)
 
 
-def normal_pictures(capture: Capture, refined: Refined) -> tuple[Any, ...]:
-    """Refined normals (height, width, 3) of every view, NaN outside the mask; a pixel that misses the mesh takes its nearest neighbour's."""
+def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[Any, ...]:
+    """Refined normals (height, width, 3) of every view, NaN outside the mask.
+
+    Views that were used show their own pixels' normals; held-out ones the vertices' normals. A pixel that misses the mesh takes its
+    nearest neighbour's.
+    """
     import numpy as np
     from scipy.ndimage import distance_transform_edt
 
@@ -177,14 +181,15 @@ def normal_pictures(capture: Capture, refined: Refined) -> tuple[Any, ...]:
     from mvps.visibility import RayCaster
 
     caster = RayCaster(refined.surface)
+    own = {view.name: maps for view, maps in zip(used.views, refined.maps, strict=True)}
     pictures = []
     for view in capture.views:
         points = points_under(caster, refined.material, view.camera, view.pixels)
+        normal = own[view.name].normal if view.name in own else points.normal
         picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
-        picture[view.mask] = np.where(points.hit[:, None], points.normal, np.nan)
-        empty = np.isnan(picture[..., 0])
+        picture[view.mask] = np.where(points.hit[:, None], normal, np.nan)
         if points.hit.any():
-            nearest = distance_transform_edt(empty, return_distances=False, return_indices=True)
+            nearest = distance_transform_edt(np.isnan(picture[..., 0]), return_distances=False, return_indices=True)
             picture = picture[tuple(nearest)]
         picture[~view.mask] = np.nan
         pictures.append(picture)
@@ -210,7 +215,7 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
     refined = stage_two(used, surface, start, maps, settings, lights is None, progress)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined)
-        pictures = normal_pictures(capture, refined)
+        pictures = normal_pictures(capture, used, refined)
     metrics = {"stages": progress.stages, "rounds": refined.rounds, "status": {"name": refined.status, "text": refined.text}}
     return Reconstruction(
         refined.surface,

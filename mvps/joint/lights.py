@@ -7,9 +7,8 @@ are eliminated. With unknowns m (all lights) and x_j (vertex j: normal, albedo, 
     [ H_xm  H_xx+P] [dx] = - [g_x]      reduces to     S dm = -(g_m - sum_j H_mj (H_jj + P_j)^-1 g_j)
 
 (Schur complement, as in bundle adjustment: Triggs et al. 2000). P_j ties the vertex's normal to the mesh's normal: without it the lights
-slide along the generalised bas-relief family (Belhumeur et al. 1999) that no image can tell. What the model cannot explain (inter-
-reflection, other lobes) is shared by all samples of a vertex, so together they weigh as one: the tie with the mesh normal's standard
-deviation sigma is multiplied by the number of samples. It redescends beyond FAR_OFF, where the mesh is not yet the surface.
+slide along the generalised bas-relief family (Belhumeur et al. 1999) that no image can tell. It counts once per sample (steps.py) and
+redescends beyond FAR_OFF, where the mesh is not yet the surface.
 Weights at their bound whose gradient keeps them there are no unknowns. A few thousand vertices say all there is to say about the lights,
 three unknowns each.
 
@@ -23,25 +22,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_equations, vertex_jacobian
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_jacobian
 from mvps.joint.observe import ViewSamples
-from solvers.least_squares import bounded_step
+from mvps.joint.steps import LARGEST_TURN, Anchor
 
 VERTICES_PER_BLOCK = 256
 
 FAR_OFF = 0.05
 """Radians between mesh and refined normal beyond which the mesh's normal is an outlier rather than noise."""
-
-LARGEST_TURN = 0.3
-"""Radians that a normal or light may turn in one step: the linearisation of n . l and of a lobe's flank ends there."""
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """The mesh's normals (V, 3), and their own standard deviation in radians."""
-
-    normal: Tensor
-    sigma: float
 
 
 def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen: Tensor) -> tuple[list[ViewSamples], Vertices, Anchor]:
@@ -53,34 +41,8 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
         rows = torch.nonzero(place[s.vertex] >= 0)[:, 0]
         few.append(ViewSamples(place[s.vertex[rows]], s.towards[rows], s.weight[rows], s.image[rows], s.data[rows]))
     state = Vertices(vertices.normal[chosen], vertices.reflectance[chosen], vertices.scale[chosen])
-    return few, state, Anchor(anchor.normal[chosen], anchor.sigma)
-
-
-def tie(hessian: Tensor, gradient: Tensor, vertices: Vertices, anchor: Anchor) -> None:
-    """Adds the tie of the normals to the mesh, |t . (n - n_mesh)|^2 / sigma^2 in units of each vertex's residual variance, in place."""
-    strength = vertices.scale**2 / anchor.sigma**2
-    away = vertices.normal - anchor.normal
-    for k, tangent in enumerate(tangents(vertices.normal)):
-        hessian[:, k, k] += strength
-        gradient[:, k] += strength * (away * tangent).sum(1)
-
-
-def vertex_step(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor
-) -> Vertices:
-    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
-    equations = vertex_equations(views, vertices, lights, sharpness)
-    scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
-    scale = scale.clamp_min(0.1 * float(scale.median()))
-    vertices = replace(vertices, scale=scale)
-    tie(equations.hessian, equations.gradient, vertices, anchor)
-    lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
-    step = bounded_step(equations.hessian, equations.gradient, lower)
-    turn = step[:, :2]
-    turn = turn * (LARGEST_TURN / turn.norm(dim=1, keepdim=True).clamp_min(LARGEST_TURN))
-    first, second = tangents(vertices.normal)
-    normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
-    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), scale)
+    tie = Anchor(anchor.normal[chosen], anchor.sigma, anchor.reflectance[chosen], anchor.reflectance_sigma[chosen])
+    return few, state, tie
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,15 @@
 
 A round:  remesh -> samples (visibility and shadows traced anew) -> vertices for fixed lights -> lights with the vertices eliminated
 -> vertices -> photometric stereo of the views under the new lights, if those moved -> agreement of views -> fused positions.
+At last the normals of every view's own pixels (pixels.py). The agreement of views must not use those: they are tied to the mesh whose
+error it is to find.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,14 +19,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mvps.camera import bilinear, pixel_footprint, project
-from mvps.joint.blocks import DirectionalLights, Vertices, vertex_equations
-from mvps.joint.lights import Anchor, light_step, subset, vertex_step, with_mean_one
+from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in
+from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import colours
+from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
 from mvps.scene import Capture, Float, Lights, Material, NormalMap, Surface
-from solvers.least_squares import damped
 from solvers.low_rank import MAD_TO_SIGMA
 
 SHARPNESS = (8.0, 32.0, 128.0)
@@ -76,11 +79,12 @@ class RefineSettings:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """surface, material and lights; per round what changed; status in words and whether it is a good one."""
+    """surface, material and lights; maps: per view its pixels' normals; per round what changed; status in words, and a sentence."""
 
     surface: Surface
     material: Material
     lights: Lights
+    maps: tuple[NormalMap, ...]
     rounds: list[dict[str, float]]
     status: str
     text: str
@@ -93,9 +97,9 @@ class _State:
     surface: Surface
     lights: Lights
     maps: tuple[NormalMap, ...]
+    maps_lights: Lights
     vertices: Vertices | None = None
     views: list[ViewSamples] = field(default_factory=list)
-    maps_lights: Lights | None = None
 
 
 def _tensor(values: Any, device: torch.device) -> torch.Tensor:
@@ -189,7 +193,7 @@ def _photometric_round(
     """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
     state.views = observe(capture, state.surface, state.lights, device)
     mesh_normal = vertex_normals(state.surface)
-    free = Anchor(_tensor(mesh_normal, device), WEAK_TIE)
+    free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(SHARPNESS))
     sharpness = _tensor(SHARPNESS, device)
     vertices = _started(state, capture, mesh_normal, carried, device)
     before = vertices.normal
@@ -199,17 +203,17 @@ def _photometric_round(
     moved = (0.0, 0.0)
     if settings.free_lights:
         deviation = np.median(np.linalg.norm(vertices.normal.cpu().numpy() - mesh_normal, axis=1))
-        tie = Anchor(free.normal, float(np.clip(MAD_TO_SIGMA * deviation, NORMAL_SIGMA / 5, NORMAL_SIGMA)))
+        tie = replace(free, sigma=float(np.clip(MAD_TO_SIGMA * deviation, NORMAL_SIGMA / 5, NORMAL_SIGMA)))
         solved = _solve_lights(state, vertices, tie, capture, settings, generator, device)
         moved = light_change(state.lights, solved)
         state.lights = solved
         lights = grey_lights(solved, device)
         for _ in range(2):
             vertices = vertex_step(state.views, vertices, lights, sharpness, free)
-        turned, brighter = light_change(state.maps_lights or solved, solved)
-        if max(np.radians(turned), brighter) > LIGHTS_MOVED:
-            state.maps, state.maps_lights = photometric_stereo(solved), solved
     state.vertices = vertices
+    turned, brighter = light_change(state.maps_lights, state.lights)
+    if max(np.radians(turned), brighter) > LIGHTS_MOVED:
+        state.maps, state.maps_lights = photometric_stereo(state.lights), state.lights
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned = _angle_deg(before.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen])
     return {
@@ -253,13 +257,13 @@ def refine(
 ) -> Refined:
     """Stage II from a rough surface, lights and the views' photometric stereo under these lights.
 
-    photometric_stereo: does the latter again for other lights; on_round(number from 1, what changed) after each round.
+    photometric_stereo does the latter again for other lights; on_round(number from 1, what changed) is called after each round.
     """
     generator = np.random.default_rng(seed)
     on = torch.device(device)
     torch.set_num_threads(1)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
-    state = _State(surface, lights, maps, maps_lights=lights)
+    state = _State(surface, lights, maps, lights)
     carried: tuple[Surface, Vertices] | None = None
     account: list[dict[str, float]] = []
     for number, round_settings in enumerate(settings.rounds, start=1):
@@ -295,26 +299,21 @@ def _finished(state: _State, capture: Capture, account: list[dict[str, float]], 
     lights = coloured_lights(grey, ratios, state.lights.one_rig)
     material = _material(state, albedo, grey, sharpness)
     status, text = _verdict(account)
-    return Refined(state.surface, material, lights, account, status, text)
+    maps = all_pixel_normals(capture, state.surface, material, lights)
+    return Refined(state.surface, material, lights, maps, account, status, text)
 
 
 def _material(state: _State, albedo: Float, lights: list[DirectionalLights], sharpness: torch.Tensor) -> Material:
     """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
     assert state.vertices is not None
     vertices, known = state.vertices, np.isfinite(albedo).all(1)
-    equations = vertex_equations(state.views, vertices, lights, sharpness)
-    count = equations.count.cpu().numpy()
-    # The samples of a vertex share the model's error: their number does not reduce it, so the covariance is taken per sample.
-    inverse = torch.linalg.inv(damped(equations.hessian, 1e-3).double().cpu())
-    variance = inverse[:, 0, 0] + inverse[:, 1, 1]
-    sigma = np.sqrt(np.maximum(variance.numpy() / 2, 0)) * vertices.scale.cpu().numpy() * np.sqrt(np.maximum(count, 1))
     nearest = np.arange(len(albedo))
     nearest[~known] = np.flatnonzero(known)[cKDTree(state.surface.vertices[known]).query(state.surface.vertices[~known])[1]]
     normal = normalise(vertices.normal.double().cpu().numpy())
     normal[~known] = vertex_normals(state.surface)[~known]
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
-    confidence = np.where(known, 1 / (1 + (sigma / NORMAL_SIGMA) ** 2), 0)
-    return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.nan_to_num(confidence))
+    certain = confidence(state.views, vertices, lights, sharpness).double().cpu().numpy()
+    return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.where(known, certain, 0))
 
 
 def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:

@@ -1,0 +1,74 @@
+"""Normals of single views at the pixels themselves, under the reflectance that all views agreed on.
+
+Every pixel takes the place of a vertex (blocks.py) with the samples of its own view alone: no interpolation blurs it and no error of the
+geometry misplaces it. Its few samples cannot tell all unknowns, so normal and reflectance are tied to the vertices' values at its first hit.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+
+from mvps.camera import view_directions
+from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.observe import ViewSamples, channel_ratio
+from mvps.joint.steps import Anchor, confidence, vertex_step
+from mvps.mesh import mean_edge_length, normalise
+from mvps.rendering import Points, points_under, shadow_at
+from mvps.scene import Capture, Float, Lights, Material, NormalMap, Surface, View
+from mvps.visibility import RayCaster
+
+NORMAL_TIE = 0.1
+"""Standard deviation, radians, of a pixel's normal from the interpolated one: twice that of a vertex's normal, as detail adds to it."""
+
+ALBEDO_TIE, WEIGHT_TIE = 0.3, 0.05
+"""Standard deviation of a pixel's albedo over the vertices' albedo, and of a lobe's weight over albedo plus weight. Albedo has edges that a
+mesh blurs; one view's lights hardly tell a lobe from a turned normal, so lobes keep close to what all views say."""
+
+STEPS = 4
+
+
+def _samples(view: View, points: Points, shadow: Float, intensity: Float, hit: Float) -> ViewSamples:
+    image = (view.samples[hit] * (view.scale / (3 * channel_ratio(intensity))).astype(np.float32)).sum(-1)
+    data = (view.samples[hit] < view.saturation).all(-1) & ~shadow[hit]
+    towards = view_directions(view.camera, points.position[hit]).astype(np.float32)
+    n = len(hit)
+    return ViewSamples(torch.arange(n), torch.from_numpy(towards), torch.ones(n), torch.from_numpy(image), torch.from_numpy(data))
+
+
+def pixel_normals(view: View, caster: RayCaster, material: Material, direction: Float, intensity: Float, offset: float) -> NormalMap:
+    """Normals, grey albedo (in all channels) and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
+
+    direction, intensity (lights, 3); offset as in visibility.py.
+    """
+    points = points_under(caster, material, view.camera, view.pixels)
+    hit = np.flatnonzero(points.hit)
+    samples = _samples(view, points, shadow_at(caster, points, direction, offset), intensity, hit)
+    known = np.column_stack([points.albedo.mean(1), points.specular_weight])[hit]
+    reflectance, normal, light, sharpness = (
+        torch.tensor(a, dtype=torch.float32) for a in (known, points.normal[hit], direction, material.sharpness)
+    )
+    spread = torch.cat([ALBEDO_TIE * reflectance[:, :1], WEIGHT_TIE * (reflectance[:, :1] + reflectance[:, 1:])], 1)
+    anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
+    lights = [DirectionalLights(light, torch.tensor(intensity.mean(1), dtype=torch.float32))]
+    state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
+    for _ in range(STEPS):
+        state = vertex_step([samples], state, lights, sharpness, anchor)
+    towards = -view.camera.rotation[2].astype(np.float32)
+    maps = NormalMap(np.tile(towards, (len(points.hit), 1)), np.zeros((len(points.hit), 3)), np.zeros(len(points.hit)))
+    normals, albedo, certain = maps.normal.copy(), maps.albedo.copy(), maps.confidence.copy()
+    normals[hit] = normalise(state.normal.double().numpy())
+    albedo[hit] = state.reflectance[:, :1].numpy()
+    certain[hit] = confidence([samples], state, lights, sharpness).numpy()
+    return NormalMap(normals, albedo, certain)
+
+
+def all_pixel_normals(capture: Capture, surface: Surface, material: Material, lights: Lights) -> tuple[NormalMap, ...]:
+    """`pixel_normals` of every view, on all cores."""
+    caster, offset = RayCaster(surface), mean_edge_length(surface)
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        tasks = zip(capture.views, lights.direction, lights.intensity, strict=True)
+        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, material, task[1], task[2], offset), tasks))

@@ -1,0 +1,84 @@
+"""Steps of the vertices' block for fixed lights.
+
+Priors are ties to a known state: of the normal to the mesh's normal, |t . (n - n_0)|^2 / sigma^2, and of the reflectance to a given one,
+|(x - x_0) / sigma_x|^2. What the model cannot explain (inter-reflection, other lobes) is shared by all samples of a vertex, so together
+they weigh as one: a tie counts as often as the vertex has samples, in units of its residual variance.
+
+The same step serves pixels of one view in the place of vertices (pixels.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
+from mvps.joint.observe import ViewSamples
+from solvers.least_squares import bounded_step, damped
+
+LARGEST_TURN = 0.3
+"""Radians that a normal or light may turn in one step: the linearisation of n . l and of a lobe's flank ends there."""
+
+RELIABLE = 0.05
+"""Standard deviation of a normal, radians, at which confidence is one half (as in photometric.py)."""
+
+LEAST_SCALE = 0.1
+"""Smallest scale of a vertex's residuals over the median one: a vertex with few samples may fit them exactly by chance."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """What the vertices are tied to: normal (V, 3) and its standard deviation in radians; reflectance (V, 1 + lobes) and its
+    standard deviation (V, 1 + lobes), infinite where free."""
+
+    normal: Tensor
+    sigma: float
+    reflectance: Tensor
+    reflectance_sigma: Tensor
+
+
+def free_reflectance(normal: Tensor, sigma: float, unknowns: int) -> Anchor:
+    """A tie of the normals alone."""
+    nothing = normal.new_zeros(len(normal), unknowns)
+    return Anchor(normal, sigma, nothing, nothing + torch.inf)
+
+
+def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> None:
+    """Adds the ties to the normal equations, in place."""
+    unit = equations.count * vertices.scale**2
+    away = vertices.normal - anchor.normal
+    for k, tangent in enumerate(tangents(vertices.normal)):
+        equations.hessian[:, k, k] += unit / anchor.sigma**2
+        equations.gradient[:, k] += unit / anchor.sigma**2 * (away * tangent).sum(1)
+    strength = unit[:, None] / anchor.reflectance_sigma**2
+    torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:] += strength
+    equations.gradient[:, 2:] += strength * (vertices.reflectance - anchor.reflectance)
+
+
+def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor) -> Vertices:
+    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
+    equations = vertex_equations(views, vertices, lights, sharpness)
+    scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
+    vertices = replace(vertices, scale=scale.clamp_min(LEAST_SCALE * float(scale.median())))
+    add_ties(equations, vertices, anchor)
+    lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
+    step = bounded_step(equations.hessian, equations.gradient, lower)
+    turn = step[:, :2]
+    turn = turn * (LARGEST_TURN / turn.norm(dim=1, keepdim=True).clamp_min(LARGEST_TURN))
+    first, second = tangents(vertices.normal)
+    normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
+    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale)
+
+
+def confidence(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor) -> Tensor:
+    """(V,) confidence in the normals: 1 / (1 + (sigma / RELIABLE)^2), sigma from the inverse of the normal equations.
+
+    The covariance is taken per sample: a vertex's samples share the model's error, so their number does not reduce it. 0 without samples.
+    """
+    equations = vertex_equations(views, vertices, lights, sharpness)
+    inverse = torch.linalg.inv(damped(equations.hessian, 1e-3).double())
+    variance = (inverse[:, 0, 0] + inverse[:, 1, 1]).clamp_min(0) / 2 * vertices.scale.double() ** 2 * equations.count
+    reliable: Tensor = 1 / (1 + variance / RELIABLE**2)
+    return torch.where(equations.count > 0, torch.nan_to_num(reliable), 0.0)
