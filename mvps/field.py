@@ -46,9 +46,9 @@ class Lattice(NamedTuple):
 def lattice(low: Tensor, high: Tensor, spacings: list[float]) -> Lattice:
     """Grids that cover the box from low (3,) to high (3,) at these spacings."""
     spacing = torch.tensor(spacings, dtype=torch.float32, device=low.device)
-    size = ((high - low) / spacing[:, None]).ceil().long() + 1
+    size = (((high - low) / spacing[:, None]).ceil().long() + 1).clamp_min(2)
     rows = size.prod(1)
-    return Lattice(low, spacing, size.clamp_min(2), torch.cumsum(rows, 0) - rows)
+    return Lattice(low, spacing, size, torch.cumsum(rows, 0) - rows)
 
 
 class Corners(NamedTuple):

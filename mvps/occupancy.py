@@ -1,254 +1,268 @@
-"""Stage I prototype."""
+"""Stage I: a neural occupancy field from silhouettes and the views' normals, by volume rendering.
+
+Field (field.py):  d(x) = hull's signed distance + residual of feature grids and a small network, in pixel footprints; occupancy
+o = sigmoid(-d / width). Along a ray with samples d_i the probability of passing sample i unstopped is sigmoid(d_i / width) where the ray
+has only come nearer, so a segment stops it with
+
+    alpha_i = 1 - min(sigmoid(d_i / w) / sigmoid(d_{i-1} / w), 1),      weight_i = alpha_i prod_{j<i} (1 - alpha_j)
+
+(occupancy rendering of UNISURF, Oechsle et al. 2021, in the unbiased form of NeuS, Wang et al. 2021: the weight peaks where d = 0 and
+not before it, which is what pulls a plain occupancy's surface inwards). Samples lie in a band around the surface last seen along
+the ray, which shrinks together with the width. The surface point x is the ray's crossing of d = 0, differentiable through its two samples.
+
+Losses (Yang et al. 2022, eq. 5-8), all but the last robust (Geman and McClure 1985), weighted by the normals' confidence:
+
+    normal  |n(x) - n_photometric|^2,   n(x) = grad d by finite differences
+    colour  |c - (albedo, normal)|^2 rendered against the pixel's photometric stereo, whose agreement between views places the surface
+    smooth  |n(x) - n(x + e)|^2
+    mask    cross-entropy of the ray's opacity in a ring around the silhouette
+
+All lengths are in pixel footprints at the object, so that the capture's unit does not matter.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mvps.camera import pixel_centres, pixel_footprint, rays
+from mvps.camera import pixel_footprint
 from mvps.field import Lattice, OccupancyField, gradient, lattice
+from mvps.fieldrays import FieldRays, foreground_rays, ring_rays, trace
 from mvps.mesh import largest_component
 from mvps.scene import Capture, Float, NormalMap, SignedDistanceGrid, Surface
+
+COLOURS = 6
+"""Rendered features: albedo and normal, three channels each."""
+
+COARSE_FACTOR = 4
+"""Coarse cells of the surface's grid are this many fine ones wide; the field is evaluated finely only near its level set."""
+
+POINTS_PER_CALL = 1 << 16
 
 
 @dataclass(frozen=True)
 class OccupancySettings:
-    steps: int = 600
-    rays: int = 2048
-    mask_rays: int = 1024
-    samples: int = 8
-    mask_samples: int = 4
+    """Lengths in pixel footprints; pairs go from the first value to the second in equal ratios.
+
+    steps, rays, ring_rays: Adam steps and rays in each; samples, ring_samples: per ray
+    finest, levels, features: spacing of the finest grid, grids (each twice as coarse as the next), features on a node
+    hidden: units of the network; band, width: of the sampling interval (+-) and of the occupancy's edge; step: of finite differences
+    ring: half-width in pixels of the ring around the silhouette; normal, colour, mask, smooth: weights of the losses
+    outlier: |difference| of unit normals or relative colours at which a pixel counts as an outlier
+    grid_rate, network_rate: Adam's; voxel: of the extracted surface
+    """
+
+    steps: int = 400
+    rays: int = 1024
+    ring_rays: int = 512
+    samples: int = 6
+    ring_samples: int = 4
     finest: float = 2.0
-    levels: int = 5
+    levels: int = 6
     features: int = 4
     hidden: int = 32
     band: tuple[float, float] = (8.0, 2.0)
     width: tuple[float, float] = (1.5, 0.5)
-    ring: int = 5
-    w_normal: float = 1.0
-    w_colour: float = 0.5
-    w_mask: float = 0.2
-    w_smooth: float = 0.1
-    rate: float = 0.05
-    net_rate: float = 0.005
-    normal_colour: bool = True
-    through: bool = True
     step: tuple[float, float] = (2.0, 1.0)
-    stride: tuple[int, ...] = (4, 2, 1)
-    robust: float = 0.5
-    root: bool = True
+    ring: int = 5
+    normal: float = 1.0
+    colour: float = 0.5
+    mask: float = 0.2
+    smooth: float = 0.03
+    outlier: float = 0.5
+    grid_rate: float = 0.1
+    network_rate: float = 0.02
     voxel: float = 1.25
-    device: str = "cpu"
 
 
-class Rays(NamedTuple):
-    anchor: Tensor
-    direction: Tensor
-    normal: Tensor
-    colour: Tensor
-    weight: Tensor
-    inside: Tensor
-    stride: Tensor
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """World = centre + unit * local; low, high (3,) the local box around the hull."""
+
+    centre: Float
+    unit: float
+    low: Tensor
+    high: Tensor
 
 
 def composite(signed_distance: Tensor, width: float) -> tuple[Tensor, Tensor]:
+    """Weights (rays, samples) and opacity (rays,) of signed distances (rays, samples) along rays, nearest first."""
     outside = torch.nn.functional.logsigmoid(signed_distance / width)
-    before, after = outside[:, :-1], outside[:, 1:]
-    alpha = -torch.expm1((after - before).clamp_max(0))
-    first = -torch.expm1(outside[:, :1])
-    alpha = torch.cat([first, alpha], 1)
+    nearer = (outside[:, 1:] - outside[:, :-1]).clamp_max(0)
+    alpha = -torch.expm1(torch.cat([outside[:, :1], nearer], 1))
+    # The small constant keeps the product's gradient finite behind an opaque sample.
     clear = torch.cumprod(1 - alpha + 1e-7, 1)
-    weight = alpha * torch.cat([torch.ones_like(first), clear[:, :-1]], 1)
+    weight = alpha * torch.cat([torch.ones_like(clear[:, :1]), clear[:, :-1]], 1)
     return weight, 1 - clear[:, -1]
 
 
-def crossing(ts, val, fallback):
-    enters = (val[:, :-1] > 0) & (val[:, 1:] <= 0)
+def crossing(distance: Tensor, signed_distance: Tensor, otherwise: Tensor) -> Tensor:
+    """(rays,) distance at which rays first enter the surface between two samples, linear in between; `otherwise` where none does."""
+    enters = (signed_distance[:, :-1] > 0) & (signed_distance[:, 1:] <= 0)
     first = enters.to(torch.uint8).argmax(1, keepdim=True)
-    d0, d1 = val.gather(1, first), val.gather(1, first + 1)
-    t0, t1 = ts.gather(1, first), ts.gather(1, first + 1)
+    d0, d1 = signed_distance.gather(1, first), signed_distance.gather(1, first + 1)
+    t0, t1 = distance.gather(1, first), distance.gather(1, first + 1)
     root = t0 + (t1 - t0) * d0 / (d0 - d1).clamp_min(1e-3)
-    return torch.where(enters.any(1), root[:, 0], fallback)
+    return torch.where(enters.any(1), root[:, 0], otherwise)
 
 
-def make_rays(capture, normal_maps, centre, unit, s, ring):
-    import cv2
-
-    out = []
-    for view, nm in zip(capture.views, normal_maps):
-        m = view.mask.astype(np.uint8)
-        if ring:
-            din = cv2.distanceTransform(m, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            dout = cv2.distanceTransform(1 - m, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            px = np.argwhere((din + dout) < ring + 0.5)
-            inside = view.mask[px[:, 0], px[:, 1]]
-            n = c = np.zeros((len(px), 3))
-            w = np.ones(len(px))
-        else:
-            px = view.pixels
-            inside = np.ones(len(px), bool)
-            n, c, w = nm.normal, nm.albedo, nm.confidence
-        o, d = rays(view.camera, pixel_centres(px))
-        o = (o - centre) / unit
-        a = o - d * (o * d).sum(-1, keepdims=True)
-        stride = np.where((px % 4 == 0).all(1), 4, np.where((px % 2 == 0).all(1), 2, 1))
-        out.append((a, d, n, c, w, inside, stride))
-    cols = [np.concatenate(x) for x in zip(*out)]
-    t = [torch.tensor(x, dtype=torch.float32, device=s.device) for x in cols]
-    return Rays(*t)
+def robust_square(square: Tensor, outlier: float) -> Tensor:
+    """Geman-McClure's bounded function of a squared residual."""
+    return square / (1 + square / outlier**2)
 
 
-@torch.no_grad()
-def trace(field, anchor, direction, low, high, through=False):
-    """first crossing or closest approach"""
-    safe = torch.where(direction.abs() < 1e-9, 1e-9, direction)
-    ends = torch.stack([(low - anchor) / safe, (high - anchor) / safe])
-    start, stop = ends.amin(0).amax(1), ends.amax(0).amin(1)
-    t = torch.where(start < stop, start, 0)
-    best = torch.full_like(t, torch.inf); best_t = t.clone()
-    live = (start < stop).nonzero()[:, 0]
-    while len(live):
-        d = torch.cat([field.signed_distance(anchor[i] + t[i, None] * direction[i]) for i in live.split(1 << 15)])
-        better = d < best[live]
-        best[live] = torch.where(better, d, best[live]); best_t[live] = torch.where(better, t[live], best_t[live])
-        t[live] = t[live] + (0.9 * d.abs()).clamp_min(1.0 if through else 0.5)
-        live = live[((d > 0.25) | through) & (t[live] < stop[live])]
-    return best_t
+def _between(pair: tuple[float, float], progress: float) -> float:
+    return pair[0] * (pair[1] / pair[0]) ** min(1.0, progress)
 
 
-def schedule(pair, f):
-    return pair[0] * (pair[1] / pair[0]) ** f
+class _Training:
+    """The field, its rays with the surface's distance last seen along each, and the optimiser."""
+
+    def __init__(self, field: OccupancyField, frame: _Frame, data: FieldRays, ring: FieldRays, settings: OccupancySettings, seed: int) -> None:
+        self.field, self.frame, self.data, self.ring, self.settings = field, frame, data, ring, settings
+        self.generator = torch.Generator().manual_seed(seed)
+        self.seen = torch.zeros(len(data.anchor))
+        self.ring_seen = torch.zeros(len(ring.anchor))
+        self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long)
+        small = [field.first, field.first_bias, field.last, field.last_bias]
+        groups = [{"params": [field.table], "lr": settings.grid_rate}, {"params": small, "lr": settings.network_rate}]
+        # A tiny epsilon: a node's gradients are small only because few rays pass it.
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+
+    def widen(self, stride: int) -> None:
+        """Take in the pixels of this stride and find the surface along their rays anew."""
+        low, high = self.frame.low, self.frame.high
+        self.pool = (self.data.stride >= stride).nonzero()[:, 0]
+        self.ring_pool = (self.ring.stride >= min(stride, 2)).nonzero()[:, 0]
+        self.seen[self.pool] = trace(self.field, self.data.anchor[self.pool], self.data.direction[self.pool], low, high, through=False)
+        chosen = self.ring_pool
+        self.ring_seen[chosen] = trace(self.field, self.ring.anchor[chosen], self.ring.direction[chosen], low, high, through=True)
+
+    def march(self, rays: FieldRays, chosen: Tensor, around: Tensor, band: float, samples: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Jittered distances, signed distances (rays, samples) and colours (rays, samples, COLOURS) in a band around a distance."""
+        jitter = torch.rand(len(chosen), 1, generator=self.generator)
+        distance = around[:, None] + band * ((torch.arange(samples) + jitter) / samples * 2 - 1)
+        points = rays.anchor[chosen][:, None] + distance[..., None] * rays.direction[chosen][:, None]
+        value, colour = self.field(points.view(-1, 3))
+        return distance, value.view(-1, samples), colour.view(-1, samples, COLOURS)
+
+    def _draw(self, pool: Tensor, count: int) -> Tensor:
+        return pool[torch.randint(len(pool), (count,), generator=self.generator)]
+
+    def mask_loss(self, band: float, width: float) -> Tensor:
+        """Cross-entropy of the opacity along rays of the ring."""
+        chosen = self._draw(self.ring_pool, self.settings.ring_rays)
+        distance, value, _ = self.march(self.ring, chosen, self.ring_seen[chosen], band, self.settings.ring_samples)
+        _, opacity = composite(value, width)
+        self.ring_seen[chosen] = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
+        return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-4, 1 - 1e-4), self.ring.inside[chosen])
+
+    def surface_loss(self, band: float, width: float, step: float) -> Tensor:
+        """Normal, colour and smoothness along rays of foreground pixels."""
+        s, data = self.settings, self.data
+        chosen = self._draw(self.pool, s.rays)
+        distance, value, colour = self.march(data, chosen, self.seen[chosen], band, s.samples)
+        weight, opacity = composite(value, width)
+        middle = torch.cat([distance[:, :1], (distance[:, 1:] + distance[:, :-1]) / 2], 1)
+        depth = crossing(distance, value, (weight * middle).sum(1) / weight.sum(1).clamp_min(1e-4))
+        nearest = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
+        self.seen[chosen] = torch.where(opacity > 0.5, depth, nearest).detach()
+        x = data.anchor[chosen] + depth[:, None] * data.direction[chosen]
+        few = s.rays // 4
+        beside = x[:few].detach() + torch.randn(few, 3, generator=self.generator) * step
+        normals, _ = gradient(self.field, torch.cat([x, beside]), step)
+        normal, other = normals[: s.rays], normals[s.rays :]
+        hit = (opacity.detach() > 0.5).float()
+        trust = data.weight[chosen] * hit
+        rendered = (weight[:, :, None] * colour).sum(1) / opacity[:, None].clamp_min(1e-3)
+        of_normal = (trust * robust_square((normal - data.normal[chosen]).square().sum(1), s.outlier)).mean()
+        of_colour = (trust * robust_square((rendered - data.colour[chosen]).square().sum(1), s.outlier)).mean()
+        of_smooth = (hit[:few] * robust_square((normal[:few] - other).square().sum(1), s.outlier)).mean()
+        return s.normal * of_normal + s.colour * of_colour + s.smooth * of_smooth
+
+    def run(self, on_step: Callable[[int, float], None]) -> None:
+        """All steps: every 4th, then 2nd, then each pixel; grids from coarse to fine; rates that rise shortly and fall to a 20th."""
+        s = self.settings
+        strides = (4, 2, 1)
+        for k in range(s.steps):
+            progress = k / s.steps
+            if k == 0 or int(progress * len(strides)) != int((k - 1) / s.steps * len(strides)):
+                self.widen(strides[int(progress * len(strides))])
+            self.field.active = max(2, min(s.levels, 2 + int(progress / 0.6 * (s.levels - 1))))
+            band, width, step = (_between(pair, 1.5 * progress) for pair in (s.band, s.width, s.step))
+            for group, rate in zip(self.optimiser.param_groups, (s.grid_rate, s.network_rate), strict=True):
+                group["lr"] = rate * min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
+            loss = self.surface_loss(band, width, step) + s.mask * self.mask_loss(band, width)
+            self.optimiser.zero_grad(set_to_none=True)
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.optimiser.step()
+            on_step(k, float(loss.detach()))
 
 
-def robust_square(sq, scale):
-    """Geman-McClure-like: scale² sq/(sq+scale²)"""
-    return sq / (1 + sq / scale**2)
-
-
-def occupancy_field(capture, hull_grid, normal_maps, settings, seed, on_step, log=None):
-    s = settings
-    gen = torch.Generator().manual_seed(seed)
-    solid = np.argwhere(hull_grid.values < 0)
-    low = hull_grid.origin + hull_grid.spacing * (solid.min(0) - 1)
-    high = hull_grid.origin + hull_grid.spacing * (solid.max(0) + 1)
+def _frame(capture: Capture, grid: SignedDistanceGrid) -> _Frame:
+    solid = np.argwhere(grid.values < 0)
+    low, high = (grid.origin + grid.spacing * (corner + pad) for corner, pad in ((solid.min(0), -1), (solid.max(0), 1)))
     centre = (low + high) / 2
-    unit = pixel_footprint([v.camera for v in capture.views], centre)
-    lo = torch.tensor((low - centre) / unit, dtype=torch.float32) - 2
-    hi = torch.tensor((high - centre) / unit, dtype=torch.float32) + 2
-    reach = float((hi - lo).norm()) / 2
-    base_grid = Lattice(
-        torch.tensor((hull_grid.origin - centre) / unit, dtype=torch.float32),
-        torch.tensor([hull_grid.spacing / unit], dtype=torch.float32),
-        torch.tensor([hull_grid.values.shape]),
+    unit = pixel_footprint([view.camera for view in capture.views], centre)
+    # Two pixels of room: the surface may lie a little outside a hull whose masks are a little small.
+    local = [torch.tensor((corner - centre) / unit, dtype=torch.float32) for corner in (low, high)]
+    return _Frame(centre, unit, local[0] - 2, local[1] + 2)
+
+
+def _field(grid: SignedDistanceGrid, frame: _Frame, settings: OccupancySettings, seed: int) -> OccupancyField:
+    base_lattice = Lattice(
+        torch.tensor((grid.origin - frame.centre) / frame.unit, dtype=torch.float32),
+        torch.tensor([grid.spacing / frame.unit], dtype=torch.float32),
+        torch.tensor([grid.values.shape]),
         torch.tensor([0]),
     )
-    base = torch.tensor(hull_grid.values / unit).reshape(-1, 1).float()
-    grids = lattice(lo, hi, [s.finest * 2**l for l in range(s.levels)][::-1])
-    colours = 6 if s.normal_colour else 3
-    field = OccupancyField(base, base_grid, grids, s.features, s.hidden, colours, gen)
-    data = make_rays(capture, normal_maps, centre, unit, s, 0)
-    ring = make_rays(capture, normal_maps, centre, unit, s, s.ring)
-    scale_c = (data.colour.mean(-1) * data.weight).sum() / data.weight.sum()
-    target = data.colour / scale_c
-    if s.normal_colour:
-        target = torch.cat([target, data.normal], 1)
-    if log:
-        log("rays", len(data.anchor), len(ring.anchor), "unit", unit, "nodes", grids.nodes())
-    opt = torch.optim.Adam(
-        [
-            {"params": [field.table], "lr": s.rate},
-            {"params": [field.first, field.first_bias, field.last, field.last_bias], "lr": s.net_rate},
-        ],
-        betas=(0.9, 0.99),
-        eps=1e-12,
-        fused=True,
-    )
-    t = torch.zeros(len(data.anchor))
-    tr = torch.zeros(len(ring.anchor))
-    stage = -1
-    for k in range(s.steps):
-        f = k / s.steps
-        st = min(int(f * len(s.stride) * 1.0), len(s.stride) - 1)
-        if st != stage:
-            stage = st
-            pool = (data.stride >= s.stride[st]).nonzero()[:, 0]
-            t[pool] = trace(field, data.anchor[pool], data.direction[pool], lo, hi)
-            rpool = (ring.stride >= min(s.stride[st], 2)).nonzero()[:, 0]
-            tr[rpool] = trace(field, ring.anchor[rpool], ring.direction[rpool], lo, hi, True)
-            if log:
-                log("stage", st, len(pool), len(rpool))
-        field.active = max(2, min(s.levels, 2 + int(f / 0.6 * (s.levels - 1))))
-        band, width, step = schedule(s.band, min(1, f * 1.5)), schedule(s.width, min(1, f * 1.5)), schedule(s.step, min(1, f * 1.5))
-        for gpar, r in zip(opt.param_groups, (s.rate, s.net_rate)):
-            gpar["lr"] = r * min(1, (k + 1) / 20) * (0.05 ** max(0, (f - 0.3) / 0.7))
-        i = pool[torch.randint(len(pool), (s.rays,), generator=gen)]
-        j = rpool[torch.randint(len(rpool), (s.mask_rays,), generator=gen)]
-        n = s.rays
+    base = torch.tensor(grid.values / frame.unit, dtype=torch.float32).reshape(-1, 1)
+    spacings = [settings.finest * 2**level for level in range(settings.levels)][::-1]
+    generator = torch.Generator().manual_seed(seed)
+    return OccupancyField(base, base_lattice, lattice(frame.low, frame.high, spacings), settings.features, settings.hidden, COLOURS, generator)
 
-        def march(origin, direction, position, samples):
-            u = torch.rand(len(position), 1, generator=gen)
-            ts = position[:, None] + band * ((torch.arange(samples) + u) / samples * 2 - 1)
-            val, col = field((origin[:, None] + ts[..., None] * direction[:, None]).view(-1, 3))
-            val = val.view(-1, samples)
-            w, opacity = composite(val, width)
-            return ts, val, col.view(-1, samples, colours), w, opacity
 
-        a, d = data.anchor[i], data.direction[i]
-        ts, val, col, w, opacity = march(a, d, t[i], s.samples)
-        mid = torch.cat([ts[:, :1], (ts[:, 1:] + ts[:, :-1]) / 2], 1)
-        depth = (w * mid).sum(1) / w.sum(1).clamp_min(1e-4)
-        if s.root:
-            depth = crossing(ts, val, depth)
-        with torch.no_grad():
-            low_t = ts.gather(1, val.argmin(1, keepdim=True))[:, 0]
-            t[i] = torch.where((opacity > 0.5), depth, low_t)
-        mts, mval, _, _, mop = march(ring.anchor[j], ring.direction[j], tr[j], s.mask_samples)
-        with torch.no_grad():
-            tr[j] = mts.gather(1, mval.argmin(1, keepdim=True))[:, 0]
-        x = a + (depth if s.through else depth.detach())[:, None] * d
-        hit = (opacity[:n].detach() > 0.5).float()
-        q = n // 4
-        jit = torch.randn(q, 3, generator=gen) * step
-        g, _ = gradient(field, torch.cat([x, x[:q].detach() + jit]), step)
-        gx, gj = g[:n], g[n:]
-        conf = data.weight[i] * hit
-        ln = (conf * robust_square((gx - data.normal[i]).square().sum(1), s.robust)).mean()
-        ls = (hit[:q] * robust_square((gx[:q] - gj).square().sum(1), s.robust)).mean()
-        c = (w[:, :, None] * col).sum(1) / opacity[:, None].clamp_min(1e-3)
-        lc = (conf * robust_square((c - target[i]).square().sum(1), s.robust)).mean()
-        op = mop.clamp(1e-4, 1 - 1e-4)
-        lm = torch.nn.functional.binary_cross_entropy(op, ring.inside[j])
-        loss = s.w_normal * ln + s.w_smooth * ls + s.w_colour * lc + s.w_mask * lm
-        opt.zero_grad(set_to_none=True)
-        loss.backward()
-        opt.step()
-        on_step(k, float(loss.detach()))
-        if log and (k % 100 == 99):
-            log(k, f"n {ln:.4f} s {ls:.4f} c {lc:.4f} m {lm:.4f} band {band:.2f} width {width:.2f} active {field.active}")
-    return extract(field, lo, hi, s.voxel, centre, unit)
+def occupancy_field(
+    capture: Capture,
+    hull_grid: SignedDistanceGrid,
+    normal_maps: tuple[NormalMap, ...],
+    settings: OccupancySettings,
+    seed: int,
+    on_step: Callable[[int, float], None],
+) -> Surface:
+    """The surface of the field trained on a capture's masks and normal maps, started at the visual hull; world units.
+
+    on_step(step from 0, loss) is called after every step. The same seed gives the same surface.
+    """
+    torch.set_num_threads(1)
+    frame = _frame(capture, hull_grid)
+    field = _field(hull_grid, frame, settings, seed)
+    data = foreground_rays(capture, normal_maps, frame.centre, frame.unit)
+    ring = ring_rays(capture, frame.centre, frame.unit, settings.ring)
+    _Training(field, frame, data, ring, settings, seed).run(on_step)
+    return extract(field, frame.low, frame.high, settings.voxel, frame.centre, frame.unit)
 
 
 @torch.no_grad()
-def extract(field, lo, hi, voxel, centre, unit):
+def extract(field: OccupancyField, low: Tensor, high: Tensor, voxel: float, centre: Float, unit: float) -> Surface:
+    """The field's zero level set on a grid of `voxel`, its largest component, faces outwards, world = centre + unit * local."""
     from skimage.measure import marching_cubes
 
-    factor = 4
-    size = ((hi - lo) / (voxel * factor)).ceil().long() + 1
-    ax = [lo[k] + voxel * factor * torch.arange(int(size[k])) for k in range(3)]
-    pts = torch.stack(torch.meshgrid(*ax, indexing="ij"), -1).view(-1, 3)
-    ev = lambda p: torch.cat([field.signed_distance(q) for q in p.split(1 << 16)])
-    coarse = ev(pts).view(*size.tolist())
-    fine = torch.nn.functional.interpolate(
-        coarse[None, None], size=[int((n - 1) * factor + 1) for n in size], mode="trilinear", align_corners=True
-    )[0, 0]
-    near = fine.abs() < voxel * factor
-    idx = near.nonzero()
-    fine[near] = ev(lo + voxel * idx.float())
-    m = torch.nn.functional.max_pool3d(near[None, None].float(), 3, 1, 1)[0, 0] > 0
-    V, F, _, _ = marching_cubes(fine.numpy(), 0.0)
-    return largest_component(Surface(centre + unit * (lo.numpy().astype(np.float64) + voxel * V.astype(np.float64)), F))
+    def values(points: Tensor) -> Tensor:
+        return torch.cat([field.signed_distance(part) for part in points.split(POINTS_PER_CALL)])
+
+    cell = voxel * COARSE_FACTOR
+    size = [int(n) for n in ((high - low) / cell).ceil().long() + 1]
+    axes = [low[k] + cell * torch.arange(size[k]) for k in range(3)]
+    coarse = values(torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)).view(*size)
+    fine_size = [(n - 1) * COARSE_FACTOR + 1 for n in size]
+    fine = torch.nn.functional.interpolate(coarse[None, None], size=fine_size, mode="trilinear", align_corners=True)[0, 0]
+    near = fine.abs() < cell
+    fine[near] = values(low + voxel * near.nonzero().float())
+    vertices, faces, _, _ = marching_cubes(fine.numpy(), 0.0)
+    local = low.numpy().astype(np.float64) + voxel * vertices.astype(np.float64)
+    return largest_component(Surface(centre + unit * local, faces))

@@ -45,17 +45,20 @@ class Settings:
     seed: int = 0
 
 
-def refine_settings(preset: str, free_lights: bool) -> RefineSettings:
-    """The rounds of Stage II. A sweep reaches as far as the last round may have left the surface off: first what a hull bulges."""
+def first_pass(free_lights: bool) -> RefineSettings:
+    """Rounds on the hull: lights and normals good enough for Stage I. Sweeps reach as far as a hull bulges over shallow hollows."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    rough = (RoundSettings(2.0, 4.0, 0.5, photometric=False), RoundSettings(2.0, 3.0, 0.5, photometric=False))
-    rounds = {
-        "draft": (*rough, RoundSettings(1.5, 2.0, 0.4)),
-        "standard": (*rough, RoundSettings(1.5, 2.0, 0.4), RoundSettings(1.0, 1.2, 0.3), RoundSettings(1.0, 1.2, 0.3)),
-        "fine": (*rough, *(RoundSettings(edge, 1.5 * edge, 0.3 * edge) for edge in (1.5, 1.0, 1.0, 0.75, 0.75))),
-    }
-    return RefineSettings(rounds[preset], free_lights=free_lights)
+    fused = (RoundSettings(2.0, 4.0, 0.5, photometric=False), RoundSettings(2.0, 3.0, 0.5, photometric=False))
+    return RefineSettings((*fused, RoundSettings(2.0, 2.0, 0.4)), free_lights=free_lights)
+
+
+def second_pass(preset: str, free_lights: bool) -> RefineSettings:
+    """Rounds after Stage I; edges in pixels, sweeps reach as far as Stage I may be off."""
+    from mvps.joint.refine import RefineSettings, RoundSettings
+
+    edges = {"draft": (1.5,), "standard": (1.5, 1.0), "fine": (1.5, 1.0, 0.75, 0.75)}[preset]
+    return RefineSettings(tuple(RoundSettings(edge, 1.2, 0.3) for edge in edges), free_lights=free_lights)
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
@@ -122,14 +125,31 @@ def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed:
         return calibration.lights
 
 
+def stage_one(
+    capture: Capture, grid: SignedDistanceGrid, maps: tuple[NormalMap, ...], settings: Settings, progress: Progress
+) -> Surface:
+    """The occupancy field under the progress bar."""
+    from mvps.occupancy import OccupancySettings, occupancy_field
+
+    plan = OccupancySettings()
+    with progress.stage("occupancy field", total=plan.steps) as stage:
+        return occupancy_field(capture, grid, maps, plan, settings.seed, lambda _, loss: stage.advance(1, loss=loss))
+
+
 def stage_two(
-    capture: Capture, surface: Surface, lights: Lights, maps: tuple[NormalMap, ...], settings: Settings, free_lights: bool, progress: Progress
+    name: str,
+    capture: Capture,
+    surface: Surface,
+    lights: Lights,
+    maps: tuple[NormalMap, ...],
+    plan: RefineSettings,
+    settings: Settings,
+    progress: Progress,
 ) -> Refined:
-    """Stage II under the progress bar."""
+    """Rounds of Stage II under the progress bar."""
     from mvps.joint.refine import refine
 
-    plan = refine_settings(settings.preset, free_lights)
-    with progress.stage("joint refinement", total=len(plan.rounds)) as stage:
+    with progress.stage(name, total=len(plan.rounds)) as stage:
 
         def on_round(_: int, changes: dict[str, float]) -> None:
             stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
@@ -212,11 +232,15 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
         maps = photometric_stereo(used, start)
-    refined = stage_two(used, surface, start, maps, settings, lights is None, progress)
+    rough = stage_two("first refinement", used, surface, start, maps, first_pass(lights is None), settings, progress)
+    with progress.stage("photometric stereo again"):
+        maps = photometric_stereo(used, rough.lights)
+    surface = stage_one(used, grid, maps, settings, progress)
+    refined = stage_two("joint refinement", used, surface, rough.lights, maps, second_pass(settings.preset, lights is None), settings, progress)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined)
         pictures = normal_pictures(capture, used, refined)
-    metrics = {"stages": progress.stages, "rounds": refined.rounds, "status": {"name": refined.status, "text": refined.text}}
+    metrics = {"stages": progress.stages, "rounds": rough.rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
     return Reconstruction(
         refined.surface,
         refined.material,

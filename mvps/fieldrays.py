@@ -1,0 +1,102 @@
+"""The rays that train an occupancy field: foreground pixels with their photometric stereo, and a ring around each silhouette.
+
+Local coordinates: (world - centre) / unit. A ray is anchored at its point nearest to the centre, so that distances along it stay small and
+exact in single precision:  x(t) = anchor + t direction.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvps.camera import pixel_centres, rays
+from mvps.field import OccupancyField
+from mvps.scene import Bool, Camera, Capture, Float, Int, NormalMap
+
+NEAR_ENOUGH = 0.25
+"""Distance, pixels, at which a traced ray has arrived: a band of two pixels around it finds the surface."""
+
+
+class FieldRays(NamedTuple):
+    """n rays: anchor, direction (n, 3); normal (n, 3), colour (n, 6) and weight (n,) of their pixels; inside (n,) 1 in the mask; stride
+    (n,) the largest of 4, 2, 1 that divides row and column."""
+
+    anchor: Tensor
+    direction: Tensor
+    normal: Tensor
+    colour: Tensor
+    weight: Tensor
+    inside: Tensor
+    stride: Tensor
+
+
+def _anchored(camera: Camera, pixels: Int, centre: Float, unit: float) -> tuple[Float, Float]:
+    origin, direction = rays(camera, pixel_centres(pixels))
+    local = (origin - centre) / unit
+    return local - direction * (local * direction).sum(-1, keepdims=True), direction
+
+
+def _stride(pixels: Int) -> Int:
+    return np.where((pixels % 4 == 0).all(1), 4, np.where((pixels % 2 == 0).all(1), 2, 1))
+
+
+def _joined(parts: list[tuple[Float, ...]]) -> FieldRays:
+    return FieldRays(*(torch.tensor(np.concatenate(column), dtype=torch.float32) for column in zip(*parts, strict=True)))
+
+
+def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre: Float, unit: float) -> FieldRays:
+    """Rays of all foreground pixels. Colour is albedo over the mean albedo, and the normal."""
+    trusted = sum(float((maps.albedo.mean(1) * maps.confidence).sum()) for maps in normal_maps)
+    total = sum(float(maps.confidence.sum()) for maps in normal_maps)
+    level = max(trusted / max(total, 1e-12), 1e-12)
+    parts: list[tuple[Float, ...]] = []
+    for view, maps in zip(capture.views, normal_maps, strict=True):
+        anchor, direction = _anchored(view.camera, view.pixels, centre, unit)
+        colour = np.concatenate([maps.albedo / level, maps.normal], 1)
+        parts.append((anchor, direction, maps.normal, colour, maps.confidence, np.ones(len(anchor)), _stride(view.pixels)))
+    return _joined(parts)
+
+
+def ring_pixels(mask: Bool, ring: int) -> Int:
+    """(n, 2) row and column of the pixels within `ring` pixels of the mask's boundary, on either side."""
+    inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for m in (mask, ~mask))
+    return np.argwhere(inside + outside < ring + 0.5)
+
+
+def ring_rays(capture: Capture, centre: Float, unit: float, ring: int) -> FieldRays:
+    """Rays of the pixels around every silhouette."""
+    parts: list[tuple[Float, ...]] = []
+    for view in capture.views:
+        pixels = ring_pixels(view.mask, ring)
+        anchor, direction = _anchored(view.camera, pixels, centre, unit)
+        nothing = np.zeros((len(pixels), 3))
+        inside = view.mask[pixels[:, 0], pixels[:, 1]]
+        parts.append((anchor, direction, nothing, nothing, np.ones(len(pixels)), inside, _stride(pixels)))
+    return _joined(parts)
+
+
+@torch.no_grad()
+def trace(field: OccupancyField, anchor: Tensor, direction: Tensor, low: Tensor, high: Tensor, through: bool) -> Tensor:
+    """(n,) distance of the field's first surface along rays within the box low, high, or of the closest approach where there is none.
+
+    through: the closest approach along the whole ray, not stopping at the first surface.
+    """
+    safe = torch.where(direction.abs() < 1e-9, 1e-9, direction)
+    ends = torch.stack([(low - anchor) / safe, (high - anchor) / safe])
+    start, stop = ends.amin(0).amax(1), ends.amax(0).amin(1)
+    t = torch.where(start < stop, start, 0)
+    best, best_t = torch.full_like(t, torch.inf), t.clone()
+    live = (start < stop).nonzero()[:, 0]
+    while len(live):
+        d = torch.cat([field.signed_distance(anchor[i] + t[i, None] * direction[i]) for i in live.split(1 << 15)])
+        better = d < best[live]
+        best[live] = torch.where(better, d, best[live])
+        best_t[live] = torch.where(better, t[live], best_t[live])
+        # A trained field is no exact distance: steps stay a little short, and at least half a pixel long so that every ray ends.
+        t[live] = t[live] + (0.9 * d.abs()).clamp_min(1.0 if through else 0.5)
+        live = live[((d > NEAR_ENOUGH) | through) & (t[live] < stop[live])]
+    return best_t
