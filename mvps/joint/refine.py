@@ -48,8 +48,9 @@ WEAK_TIE = 0.3
 LIGHTS_MOVED = 0.01
 """Change of the lights, radians or relative intensity, from which the views' photometric stereo is done again."""
 
-STILL_DEG = 0.5
-"""Mean change of normals in a round below which they have settled: a tenth of the bar for good normals (5 deg)."""
+STILL_DEG = 0.25
+"""Mean change of normals in the last Gauss-Newton step, and of lights in the last round, below which they have settled: Gauss-Newton at
+least halves its steps near a minimum, so that all further steps together are no longer than this."""
 
 POOR_FIT = 0.1
 """Relative residual above which the model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy objects."""
@@ -208,19 +209,21 @@ def _photometric_round(
         moved = light_change(state.lights, solved)
         state.lights = solved
         lights = grey_lights(solved, device)
-        for _ in range(2):
-            vertices = vertex_step(state.views, vertices, lights, sharpness, free)
+    for _ in range(2):
+        last = vertices.normal
+        vertices = vertex_step(state.views, vertices, lights, sharpness, free)
     state.vertices = vertices
     turned, brighter = light_change(state.maps_lights, state.lights)
     if max(np.radians(turned), brighter) > LIGHTS_MOVED:
         state.maps, state.maps_lights = photometric_stereo(state.lights), state.lights
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
-    turned = _angle_deg(before.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen])
+    turned, settling = (_angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     return {
         "residual": relative_residual(state.views, vertices),
         "light_change_deg": moved[0],
         "intensity_change": moved[1],
         "normal_change_deg": float(np.mean(turned)),
+        "last_step_deg": float(np.mean(settling)),
     }
 
 
@@ -324,12 +327,12 @@ def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:
             f"The model fits badly: it leaves {100 * last['residual']:.0f} % of the images' signal unexplained (good fits leave under"
             f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks or poses."
         )
-    if last["normal_change_deg"] > STILL_DEG:
+    if max(last["last_step_deg"], last["light_change_deg"]) > STILL_DEG:
         return "not settled", (
-            f"Normals still changed by {last['normal_change_deg']:.2f} deg in the last round (settled below {STILL_DEG} deg);"
-            " a finer preset does more rounds."
+            f"In the last step normals still turned by {last['last_step_deg']:.2f} deg, in the last round lights by"
+            f" {last['light_change_deg']:.2f} deg (settled below {STILL_DEG} deg); a finer preset does more rounds."
         )
     return "converged", (
-        f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last round normals changed by"
-        f" {last['normal_change_deg']:.2f} deg, lights by {last['light_change_deg']:.2f} deg, vertices by {last['vertex_change_px']:.2f} px."
+        f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last step normals turned by"
+        f" {last['last_step_deg']:.2f} deg, in the last round lights by {last['light_change_deg']:.2f} deg, vertices by {last['vertex_change_px']:.2f} px."
     )
