@@ -104,13 +104,22 @@ def evaluate_result(result: Path, truth: Path) -> dict[str, float]:
     return evaluate(reconstruction, read_views(truth, reconstruction, true_values), true_values)
 
 
+def renew_report(result: Path, truth: Path) -> None:
+    """The result's report.html made again, now with the figures against ground truth."""
+    from mvps.export import read_reconstruction
+    from mvps.load import read_capture
+    from mvps.report import write_report
+
+    write_report(read_reconstruction(result), read_capture(truth), result / "report.html")
+
+
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     made = parser(
         "mvps.evaluate",
         "Compare a reconstruction with ground truth: surface (mm and pixels), normals (degrees), lights (degrees, relative\n"
         "intensity), held-out photographs (PSNR, dB). Figures in mm are in the capture's own unit of length. The figures are\n"
-        "added to RESULT/metrics.json as 'truth'.",
+        "added to RESULT/metrics.json as 'truth', and to RESULT/report.html.",
     )
     made.add_argument("result", type=Path, metavar="RESULT", help="folder that mvps.reconstruct wrote")
     made.add_argument("--truth", type=Path, required=True, default=SUPPRESS, metavar="CAPTURE", help="the capture, with its ground truth")
@@ -120,6 +129,7 @@ def main(argv: Sequence[str]) -> None:
     metrics_file = options.result / "metrics.json"
     metrics = json.loads(metrics_file.read_text(encoding="utf-8"))
     write_json(metrics_file, metrics | {"truth": errors})
+    renew_report(options.result, options.truth)
     if "json" in options:
         write_json(options.json, errors)
     print(table(errors))

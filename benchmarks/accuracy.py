@@ -1,0 +1,93 @@
+"""Figures per capture: reconstruct through the command line, evaluate, and keep a table.
+
+    python benchmarks/accuracy.py CAPTURES [bunny armadillo spot buddha] [--preset standard]
+
+CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file: errors against
+ground truth (which the reconstruction never reads), seconds of the whole command, and its peak memory, with the machine named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+
+COLUMNS = (
+    ("light deg", "light_error_deg", 1, 2),
+    ("intensity %", "intensity_error", 100, 2),
+    ("normal map deg", "map_normal_error_deg", 1, 2),
+    ("mesh normal deg", "mesh_normal_error_deg", 1, 2),
+    ("Chamfer px", "chamfer_px", 1, 3),
+    ("Chamfer mm", "chamfer_mm", 1, 3),
+    ("signed offset px", "offset_px", 1, 3),
+    ("F@0.5 mm", "f_score_0_5_mm", 1, 3),
+    ("s", "seconds", 1, 0),
+    ("peak MB", "peak_memory_mb", 1, 0),
+)
+
+
+def machine() -> str:
+    """Processor, cores and Python's version."""
+    model = next((line.split(":")[1].strip() for line in open("/proc/cpuinfo", encoding="utf-8") if line.startswith("model name")), "")
+    return f"{model or platform.processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
+
+
+def measure(capture: Path, preset: str, folder: Path) -> dict[str, Any]:
+    """One row: the figures of one capture."""
+    result, figures = folder / capture.name, folder / f"{capture.name}.json"
+    start = time.perf_counter()
+    command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet"]
+    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+    seconds = time.perf_counter() - start
+    command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture), "--json", str(figures)]
+    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+    metrics = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
+    stages = metrics["stages"]
+    return {
+        "capture": capture.name,
+        **metrics["truth"],
+        "seconds": seconds,
+        "peak_memory_mb": max(stage["peak_memory_mb"] for stage in stages),
+        "status": metrics["status"]["name"],
+        "stages": {stage["name"]: stage["seconds"] for stage in stages},
+    }
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The rows as Markdown."""
+    titles = ["capture", *(title for title, *_ in COLUMNS), "status"]
+    lines = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
+    for row in rows:
+        figures = [f"{factor * row[key]:.{digits}f}" if key in row else "-" for _, key, factor, digits in COLUMNS]
+        lines.append("| " + " | ".join([row["capture"], *figures, row["status"]]) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path)
+    parser.add_argument("names", nargs="*", default=["bunny", "armadillo", "spot", "buddha"])
+    parser.add_argument("--preset", default="standard")
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        rows = [measure(given.captures / name, given.preset, Path(folder)) for name in given.names]
+    stem = HERE / f"accuracy-{given.preset}"
+    record = {"machine": machine(), "preset": given.preset, "rows": rows}
+    stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    text = f"`python benchmarks/accuracy.py CAPTURES --preset {given.preset}` on {machine()}.\n\n{table(rows)}\n"
+    stem.with_suffix(".md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
