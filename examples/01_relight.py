@@ -1,6 +1,6 @@
 """A finished reconstruction, seen four ways: photograph, refined normals, albedo, and lit from a side that was never photographed.
 
-    python examples/01_relight.py RESULT CAPTURE picture.png
+python examples/01_relight.py RESULT CAPTURE picture.png
 """
 
 import sys

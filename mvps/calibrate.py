@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.mesh import normalise, vertex_normals
-from mvps.scene import Bool, Camera, Capture, Float, Lights, Surface, View
-from mvps.visibility import RayCaster, camera_hits, interpolate
+from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
+from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
 
 MINIMUM_LIGHTS = 4
@@ -78,7 +78,8 @@ class _Sampled:
 def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> _Sampled:
     chosen = generator.permutation(len(view.pixels))[:PIXELS_PER_VIEW]
     hits = camera_hits(caster, view.camera, view.pixels[chosen])
-    chosen, hits = chosen[hits.face >= 0], type(hits)(*(part[hits.face >= 0] for part in hits))
+    on = hits.face >= 0
+    chosen, hits = chosen[on], Hits(hits.face[on], hits.barycentric[on], hits.distance[on])
     image = view.samples[chosen].astype(np.float64).mean(-1) * view.scale
     bright = np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True)
     bright = np.maximum(bright, view.scale)
@@ -127,16 +128,23 @@ def solve_ambiguity(pseudo: Float, normal: Float, weight: Float) -> Float:
         if not np.isfinite(A).all() or abs(determinant) < 1e-9 * np.abs(A).max() ** 3:
             raise np.linalg.LinAlgError("the normals of the rough shape span no volume, so the lights' ambiguity cannot be fixed")
         A = _angle_step(A / np.cbrt(abs(determinant)), pseudo, normal, weight, float(scale))
-    return A / np.cbrt(abs(np.linalg.det(A)))
+    unimodular: Float = A / np.cbrt(abs(np.linalg.det(A)))
+    return unimodular
 
 
 def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
     """(lights, 3) intensity times direction in the frame of the samples' normals."""
     normal = np.concatenate([s.normal for s in samples])
-    A = solve_ambiguity(factors.left, normal, factors.weight.mean(1).astype(np.float64))
+    try:
+        A = solve_ambiguity(factors.left, normal, factors.weight.mean(1).astype(np.float64))
+    except np.linalg.LinAlgError as error:
+        raise CaptureError(
+            f"lights: wanted a rough shape whose normals point many ways, given one where {error}; use more views or --calibrated-lights"
+        ) from error
     # The median albedo is the unit, so that lights of separately solved views share one scale.
     albedo = np.linalg.norm(factors.left @ A.T, axis=1) * np.concatenate([s.bright for s in samples])
-    return factors.right @ np.linalg.inv(A) * np.median(albedo)
+    scaled: Float = factors.right @ np.linalg.inv(A) * np.median(albedo)
+    return scaled
 
 
 def _from_normals(sample: _Sampled) -> Float:
@@ -148,21 +156,18 @@ def _from_normals(sample: _Sampled) -> Float:
         residual = absolute - sample.normal @ lights.T
         weights = robust_weights(residual.T, lit.T, sample.noise)
         lights = solve_rows(absolute.T, weights, sample.normal)
-    return lights * np.median(sample.bright)
+    scaled: Float = lights * np.median(sample.bright)
+    return scaled
 
 
 def colour_ratios(view: View) -> Float:
     """(lights, 3) intensity of each light's channels over their mean, from the colour of the whole view: the object's mean
     albedo is taken as the mean over all lights, so only differences between lights count."""
-    total = view.samples.astype(np.float64).sum(0) if view.samples.nbytes < 1 << 26 else _blockwise_sum(view)
-    total = np.maximum(total, 1.0)
+    total = np.maximum(view.samples.sum(0, dtype=np.float64), 1.0)
     chroma = total / total.mean(1, keepdims=True)
     ratio = chroma / np.median(chroma, axis=0)
-    return ratio / ratio.mean(1, keepdims=True)
-
-
-def _blockwise_sum(view: View) -> Float:
-    return np.sum([view.samples[i : i + 4096].astype(np.float64).sum(0) for i in range(0, len(view.samples), 4096)], axis=0)
+    of_mean_one: Float = ratio / ratio.mean(1, keepdims=True)
+    return of_mean_one
 
 
 def normalised(directions: list[Float], intensities: list[Float], one_rig: bool) -> Lights:

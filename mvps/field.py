@@ -117,7 +117,7 @@ class Interpolation(torch.autograd.Function):
 
 def interpolate(table: Tensor, points: Tensor, grids: Lattice) -> Tensor:
     """Values (levels, n, features) at points (n, 3) of a table (rows, features) on the nodes of grids."""
-    result: Tensor = Interpolation.apply(table, points, grids)
+    result: Tensor = Interpolation.apply(table, points, grids)  # type: ignore[no-untyped-call]
     return result
 
 

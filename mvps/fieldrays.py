@@ -6,11 +6,12 @@ exact in single precision:  x(t) = anchor + t direction.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvps.camera import pixel_centres, rays
@@ -44,7 +45,7 @@ def _stride(pixels: Int) -> Int:
     return np.where((pixels % 4 == 0).all(1), 4, np.where((pixels % 2 == 0).all(1), 2, 1))
 
 
-def _joined(parts: list[tuple[Float, ...]]) -> FieldRays:
+def _joined(parts: list[tuple[NDArray[Any], ...]]) -> FieldRays:
     return FieldRays(*(torch.tensor(np.concatenate(column), dtype=torch.float32) for column in zip(*parts, strict=True)))
 
 
@@ -53,7 +54,7 @@ def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre
     trusted = sum(float((maps.albedo.mean(1) * maps.confidence).sum()) for maps in normal_maps)
     total = sum(float(maps.confidence.sum()) for maps in normal_maps)
     level = max(trusted / max(total, 1e-12), 1e-12)
-    parts: list[tuple[Float, ...]] = []
+    parts: list[tuple[NDArray[Any], ...]] = []
     for view, maps in zip(capture.views, normal_maps, strict=True):
         anchor, direction = _anchored(view.camera, view.pixels, centre, unit)
         colour = np.concatenate([maps.albedo / level, maps.normal], 1)
@@ -69,7 +70,7 @@ def ring_pixels(mask: Bool, ring: int) -> Int:
 
 def ring_rays(capture: Capture, centre: Float, unit: float, ring: int) -> FieldRays:
     """Rays of the pixels around every silhouette."""
-    parts: list[tuple[Float, ...]] = []
+    parts: list[tuple[NDArray[Any], ...]] = []
     for view in capture.views:
         pixels = ring_pixels(view.mask, ring)
         anchor, direction = _anchored(view.camera, pixels, centre, unit)

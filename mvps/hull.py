@@ -40,7 +40,8 @@ def mask_distance(mask: Bool) -> NDArray[np.float32]:
     inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     signed: NDArray[np.float32] = np.where(mask, 0.5 - inside, outside - 0.5).astype(np.float32)
-    return cv2.GaussianBlur(signed, (0, 0), STAIRCASE_PIXELS, borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(signed, (0, 0), STAIRCASE_PIXELS, borderType=cv2.BORDER_REPLICATE)
+    return smooth.astype(np.float32)
 
 
 def bounds(capture: Capture) -> tuple[Float, Float]:
@@ -56,8 +57,10 @@ def bounds(capture: Capture) -> tuple[Float, Float]:
         sides = [(columns.min(), 0, 1.0), (columns.max() + 1, 0, -1.0), (rows.min(), 1, 1.0), (rows.max() + 1, 1, -1.0)]
         for limit, axis, sign in sides:
             plane = sign * (limit * P[2] - P[axis])
-            normals.append(plane[:3]), offsets.append(-plane[3])
-        normals.append(-P[2, :3]), offsets.append(P[2, 3])
+            normals.append(plane[:3])
+            offsets.append(-plane[3])
+        normals.append(-P[2, :3])
+        offsets.append(P[2, 3])
     A, b = np.array(normals), np.array(offsets)
     scale = np.linalg.norm(A, axis=1)
     # Distances to the first camera's centre as the unit keep the programme well scaled in any unit of the capture.
@@ -110,7 +113,8 @@ def _grid_points(origin: Float, spacing: float, shape: tuple[int, int, int]) -> 
 def _sample(capture: Capture, low: Float, high: Float, cells: int) -> SignedDistanceGrid:
     spacing = float((high - low).max()) / cells
     origin = low - MARGIN_CELLS * spacing
-    shape = tuple(int(n) for n in np.ceil((high - low) / spacing).astype(int) + 2 * MARGIN_CELLS + 1)
+    nx, ny, nz = (int(n) + 2 * MARGIN_CELLS + 1 for n in np.ceil((high - low) / spacing))
+    shape = (nx, ny, nz)
     values = _cut(capture, _grid_points(origin, spacing, shape)).reshape(shape)
     return SignedDistanceGrid(values, origin, spacing)
 

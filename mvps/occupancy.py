@@ -116,13 +116,15 @@ def robust_square(square: Tensor, outlier: float) -> Tensor:
 
 
 def _between(pair: tuple[float, float], progress: float) -> float:
-    return pair[0] * (pair[1] / pair[0]) ** min(1.0, progress)
+    return float(pair[0] * (pair[1] / pair[0]) ** min(1.0, progress))
 
 
 class _Training:
     """The field, its rays with the surface's distance last seen along each, and the optimiser."""
 
-    def __init__(self, field: OccupancyField, frame: _Frame, data: FieldRays, ring: FieldRays, settings: OccupancySettings, seed: int) -> None:
+    def __init__(
+        self, field: OccupancyField, frame: _Frame, data: FieldRays, ring: FieldRays, settings: OccupancySettings, seed: int
+    ) -> None:
         self.field, self.frame, self.data, self.ring, self.settings = field, frame, data, ring, settings
         self.generator = torch.Generator().manual_seed(seed)
         self.seen = torch.zeros(len(data.anchor))
@@ -198,7 +200,7 @@ class _Training:
                 group["lr"] = rate * min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
             loss = self.surface_loss(band, width, step) + s.mask * self.mask_loss(band, width)
             self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()  # type: ignore[no-untyped-call]
+            loss.backward()
             self.optimiser.step()
             on_step(k, float(loss.detach()))
 
@@ -223,7 +225,9 @@ def _field(grid: SignedDistanceGrid, frame: _Frame, settings: OccupancySettings,
     base = torch.tensor(grid.values / frame.unit, dtype=torch.float32).reshape(-1, 1)
     spacings = [settings.finest * 2**level for level in range(settings.levels)][::-1]
     generator = torch.Generator().manual_seed(seed)
-    return OccupancyField(base, base_lattice, lattice(frame.low, frame.high, spacings), settings.features, settings.hidden, COLOURS, generator)
+    return OccupancyField(
+        base, base_lattice, lattice(frame.low, frame.high, spacings), settings.features, settings.hidden, COLOURS, generator
+    )
 
 
 def occupancy_field(

@@ -28,7 +28,8 @@ RELIABLE = 0.05
 
 def grey(view: View, intensity: Float, part: slice) -> NDArray[np.float64]:
     """(n, lights) mean over channels of radiance over intensity (lights, 3)."""
-    return (view.samples[part] * (view.scale / intensity)).mean(-1)
+    image: NDArray[np.float64] = (view.samples[part] * (view.scale / intensity)).mean(-1)
+    return image
 
 
 def normal_map(view: View, direction: Float, intensity: Float) -> NormalMap:
@@ -39,7 +40,7 @@ def normal_map(view: View, direction: Float, intensity: Float) -> NormalMap:
     towards = -rays(view.camera, pixel_centres(view.pixels))[1]
     for start in range(0, pixels, PIXELS_PER_CHUNK):
         part = slice(start, min(start + PIXELS_PER_CHUNK, pixels))
-        known = (view.samples[part] < view.saturation).all(-1).astype(np.float64)
+        known = view.usable()[part].astype(np.float64)
         b, weight, sigma = _solve(grey(view, intensity, part), known, direction, noise)
         length = np.linalg.norm(b, axis=1, keepdims=True)
         solved = (length[:, 0] > noise) & np.isfinite(sigma)

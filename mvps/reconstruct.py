@@ -1,7 +1,7 @@
 """The pipeline, photographs in, textured mesh out, and its command line.
 
-    capture -> visual hull -> lights -> photometric stereo of every view -> Stage I: occupancy field -> Stage II: everything together
-            -> lights of held-out photographs, normal maps -> textures, report, result folder
+capture -> visual hull -> lights -> photometric stereo of every view -> Stage I: occupancy field -> Stage II: everything together
+        -> lights of held-out photographs, normal maps -> textures, report, result folder
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +82,7 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
 
 
 def chosen_device(device: str) -> str:
-    """"cpu" or "cuda" for auto, cpu or cuda; CaptureError where cuda is asked for and not there."""
+    """ "cpu" or "cuda" for auto, cpu or cuda; CaptureError where cuda is asked for and not there."""
     import torch
 
     if device == "cuda" and not torch.cuda.is_available():
@@ -125,9 +126,7 @@ def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed:
         return calibration.lights
 
 
-def stage_one(
-    capture: Capture, grid: SignedDistanceGrid, maps: tuple[NormalMap, ...], settings: Settings, progress: Progress
-) -> Surface:
+def stage_one(capture: Capture, grid: SignedDistanceGrid, maps: tuple[NormalMap, ...], settings: Settings, progress: Progress) -> Surface:
     """The occupancy field under the progress bar."""
     from mvps.occupancy import OccupancySettings, occupancy_field
 
@@ -155,7 +154,8 @@ def stage_two(
             stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
 
         device = chosen_device(settings.device)
-        refined = refine(capture, surface, lights, maps, lambda new: photometric_stereo(capture, new), plan, settings.seed, device, on_round)
+        again = partial(photometric_stereo, capture)
+        refined = refine(capture, surface, lights, maps, again, plan, settings.seed, device, on_round)
         stage.status(refined.status)
     return refined
 
@@ -236,7 +236,8 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
     with progress.stage("photometric stereo again"):
         maps = photometric_stereo(used, rough.lights)
     surface = stage_one(used, grid, maps, settings, progress)
-    refined = stage_two("joint refinement", used, surface, rough.lights, maps, second_pass(settings.preset, lights is None), settings, progress)
+    plan = second_pass(settings.preset, lights is None)
+    refined = stage_two("joint refinement", used, surface, rough.lights, maps, plan, settings, progress)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined)
         pictures = normal_pictures(capture, used, refined)

@@ -30,7 +30,9 @@ def test_relight_makes_a_picture_of_four_parts(tmp_path: Path, monkeypatch: pyte
     names = tuple(view.name for view in capture.views)
     lights = Lights(tuple(truth.direction[n] for n in names), tuple(truth.intensity[n] for n in names), True)
     empty = tuple(truth.normals[n] for n in names)
-    material = Material(vertex_normals(scene.surface), *(getattr(scene.material, k) for k in ("albedo", "specular_weight", "sharpness", "confidence")))
+    material = Material(
+        vertex_normals(scene.surface), *(getattr(scene.material, k) for k in ("albedo", "specular_weight", "sharpness", "confidence"))
+    )
     result = Reconstruction(scene.surface, material, lights, names, tuple(view.lights for view in capture.views), empty)
     write_reconstruction(result, tmp_path / "result")
     monkeypatch.setattr(sys, "argv", ["01_relight.py", str(tmp_path / "result"), str(tmp_path / "capture"), str(tmp_path / "picture.png")])

@@ -43,7 +43,12 @@ def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[to
 
 
 def _step(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: torch.Tensor, rotations: list[torch.Tensor], one_rig: bool
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    sharpness: torch.Tensor,
+    rotations: list[torch.Tensor],
+    one_rig: bool,
 ) -> list[DirectionalLights]:
     sums = []
     for samples, of_view, rotation in zip(views, lights, rotations, strict=True):
@@ -99,4 +104,3 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     ratios = [channel_ratio(e) for e in white]
     _, ratios = colours(capture, surface, views, vertices, grey, sharpness, ratios, one_rig)
     return _as_lights(grey, ratios, one_rig)
-

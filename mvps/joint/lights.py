@@ -126,7 +126,8 @@ def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor)
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
     diagonal = torch.diagonal(H).clamp_min(0)
     H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max())
-    return -torch.linalg.solve(H, g)
+    step: Tensor = -torch.linalg.solve(H, g)
+    return step
 
 
 def light_step(

@@ -83,7 +83,7 @@ def sample_grey(view: View, ratio: Float, positions: Int, weights: Float) -> tup
     return image, usable
 
 
-def _pairs(view: View, caster: RayCaster, normal: Float, offset: float) -> tuple[Int, Float, Float, Float]:
+def _pairs(view: View, caster: RayCaster, normal: Float, offset: float) -> tuple[Int, Float, Int, Float]:
     """Vertices (n,) that a view sees, with the weight of the pair (n,) and the bilinear positions and weights (n, 4)."""
     vertex = np.flatnonzero(visible_vertices(caster, view.camera, normal, offset))
     points = caster.surface.vertices[vertex]

@@ -1,7 +1,8 @@
 """Normals of single views at the pixels themselves, under the reflectance that all views agreed on.
 
 Every pixel takes the place of a vertex (blocks.py) with the samples of its own view alone: no interpolation blurs it and no error of the
-geometry misplaces it. Its few samples cannot tell all unknowns, so normal and reflectance are tied to the vertices' values at its first hit.
+geometry misplaces it. Its few samples cannot tell all unknowns, so normal and reflectance are tied to the vertices' values at its
+first hit.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio
 from mvps.joint.steps import Anchor, confidence, vertex_step
 from mvps.mesh import mean_edge_length, normalise
 from mvps.rendering import Points, points_under, shadow_at
-from mvps.scene import Capture, Float, Lights, Material, NormalMap, Surface, View
+from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
 from mvps.visibility import RayCaster
 
 NORMAL_TIE = 0.1
@@ -31,7 +32,7 @@ mesh blurs; one view's lights hardly tell a lobe from a turned normal, so lobes 
 STEPS = 4
 
 
-def _samples(view: View, points: Points, shadow: Float, intensity: Float, hit: Float) -> ViewSamples:
+def _samples(view: View, points: Points, shadow: Bool, intensity: Float, hit: Int) -> ViewSamples:
     image = (view.samples[hit] * (view.scale / (3 * channel_ratio(intensity))).astype(np.float32)).sum(-1)
     data = (view.samples[hit] < view.saturation).all(-1) & ~shadow[hit]
     towards = view_directions(view.camera, points.position[hit]).astype(np.float32)
@@ -58,8 +59,9 @@ def pixel_normals(view: View, caster: RayCaster, material: Material, direction: 
     for _ in range(STEPS):
         state = vertex_step([samples], state, lights, sharpness, anchor)
     towards = -view.camera.rotation[2].astype(np.float32)
-    maps = NormalMap(np.tile(towards, (len(points.hit), 1)), np.zeros((len(points.hit), 3)), np.zeros(len(points.hit)))
-    normals, albedo, certain = maps.normal.copy(), maps.albedo.copy(), maps.confidence.copy()
+    pixels = len(points.hit)
+    normals = np.tile(towards, (pixels, 1))
+    albedo, certain = np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
     normals[hit] = normalise(state.normal.double().numpy())
     albedo[hit] = state.reflectance[:, :1].numpy()
     certain[hit] = confidence([samples], state, lights, sharpness).numpy()

@@ -9,7 +9,6 @@ error it is to find.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -134,7 +133,9 @@ def fused_maps(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], 
     return normalise(normal), albedo / np.maximum(total, 1e-12), total
 
 
-def _started(state: _State, capture: Capture, anchor: NDArray[Any], carried: tuple[Surface, Vertices] | None, device: torch.device) -> Vertices:
+def _started(
+    state: _State, capture: Capture, anchor: NDArray[Any], carried: tuple[Surface, Vertices] | None, device: torch.device
+) -> Vertices:
     """Vertices of the new mesh: from the nearest vertex of the last round's, or from the views' photometric stereo."""
     if carried is not None:
         nearest = torch.from_numpy(cKDTree(carried[0].vertices).query(state.surface.vertices)[1])
@@ -150,7 +151,13 @@ def _started(state: _State, capture: Capture, anchor: NDArray[Any], carried: tup
 
 
 def _solve_lights(
-    state: _State, vertices: Vertices, anchor: Anchor, capture: Capture, settings: RefineSettings, generator: np.random.Generator, device: torch.device
+    state: _State,
+    vertices: Vertices,
+    anchor: Anchor,
+    capture: Capture,
+    settings: RefineSettings,
+    generator: np.random.Generator,
+    device: torch.device,
 ) -> Lights:
     """The lights solved on a random part of the vertices, which are solved along."""
     seen = torch.zeros(len(vertices.normal), dtype=torch.bool, device=device)
@@ -213,8 +220,8 @@ def _photometric_round(
         last = vertices.normal
         vertices = vertex_step(state.views, vertices, lights, sharpness, free)
     state.vertices = vertices
-    turned, brighter = light_change(state.maps_lights, state.lights)
-    if max(np.radians(turned), brighter) > LIGHTS_MOVED:
+    turn_of_lights, brighter = light_change(state.maps_lights, state.lights)
+    if max(np.radians(turn_of_lights), brighter) > LIGHTS_MOVED:
         state.maps, state.maps_lights = photometric_stereo(state.lights), state.lights
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (_angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
@@ -241,7 +248,9 @@ def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
     return float((vertices.scale[seen] / level).median())
 
 
-def _moved(surface: Surface, normal: Float, state: _State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float) -> Surface:
+def _moved(
+    surface: Surface, normal: Float, state: _State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
+) -> Surface:
     offsets = np.arange(-settings.reach, settings.reach + settings.step / 2, settings.step) * pixel
     agreed: Agreement = agreement(capture, surface, state.maps, seen, offsets, COST_SMOOTHINGS)
     return fuse(surface, normal, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel)
@@ -325,7 +334,8 @@ def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:
     if last["residual"] > POOR_FIT:
         return "poor fit", (
             f"The model fits badly: it leaves {100 * last['residual']:.0f} % of the images' signal unexplained (good fits leave under"
-            f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks or poses."
+            f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks"
+            " or poses."
         )
     if max(last["last_step_deg"], last["light_change_deg"]) > STILL_DEG:
         return "not settled", (
@@ -334,5 +344,6 @@ def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:
         )
     return "converged", (
         f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last step normals turned by"
-        f" {last['last_step_deg']:.2f} deg, in the last round lights by {last['light_change_deg']:.2f} deg, vertices by {last['vertex_change_px']:.2f} px."
+        f" {last['last_step_deg']:.2f} deg, in the last round lights by {last['light_change_deg']:.2f} deg,"
+        f" vertices by {last['vertex_change_px']:.2f} px."
     )

@@ -57,7 +57,9 @@ def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> 
     equations.gradient[:, 2:] += strength * (vertices.reflectance - anchor.reflectance)
 
 
-def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor) -> Vertices:
+def vertex_step(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor
+) -> Vertices:
     """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
     equations = vertex_equations(views, vertices, lights, sharpness)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
