@@ -38,9 +38,10 @@ def normal_map(view: View, direction: Float, intensity: Float) -> NormalMap:
     normal, albedo, confidence = np.empty((pixels, 3)), np.empty((pixels, 3)), np.empty(pixels)
     noise = float(view.scale / np.mean(intensity))
     towards = -rays(view.camera, pixel_centres(view.pixels))[1]
+    usable = view.usable()
     for start in range(0, pixels, PIXELS_PER_CHUNK):
         part = slice(start, min(start + PIXELS_PER_CHUNK, pixels))
-        known = view.usable()[part].astype(np.float64)
+        known = usable[part].astype(np.float64)
         b, weight, sigma = _solve(grey(view, intensity, part), known, direction, noise)
         length = np.linalg.norm(b, axis=1, keepdims=True)
         solved = (length[:, 0] > noise) & np.isfinite(sigma)
