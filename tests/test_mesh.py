@@ -1,0 +1,67 @@
+"""Discrete geometry: laws of the operators."""
+
+import numpy as np
+import trimesh
+
+from mvps import mesh
+from mvps.scene import Surface
+
+
+def sphere(subdivisions: int = 4, radius: float = 2.0) -> Surface:
+    ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Surface(np.array(ball.vertices), np.array(ball.faces))
+
+
+def sheet(n: int = 8) -> Surface:
+    x, y = np.meshgrid(np.arange(n, dtype=float), np.arange(n, dtype=float), indexing="ij")
+    corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([corner, corner + n, corner + 1], 1), np.stack([corner + 1, corner + n, corner + n + 1], 1)])
+    return Surface(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1), faces)
+
+
+def test_laplacian_is_symmetric_positive_semidefinite_and_kills_constants() -> None:
+    L = mesh.cotangent_laplacian(sphere(2)).toarray()
+    assert np.allclose(L, L.T) and np.allclose(L.sum(1), 0, atol=1e-10) and np.linalg.eigvalsh(L)[0] > -1e-9
+
+
+def test_laplacian_of_a_linear_function_vanishes_inside_a_flat_sheet() -> None:
+    flat = sheet()
+    inside = ((flat.vertices[:, :2] > 0) & (flat.vertices[:, :2] < 7)).all(1)
+    values = mesh.cotangent_laplacian(flat) @ (3 * flat.vertices[:, 0] - flat.vertices[:, 1])
+    assert np.abs(values[inside]).max() < 1e-12 < np.abs(values).max()
+
+
+def test_mass_sums_to_the_area() -> None:
+    ball = sphere()
+    assert np.isclose(mesh.mass_matrix(ball).diagonal().sum(), mesh.face_areas(ball).sum())
+    assert np.isclose(mesh.face_areas(ball).sum(), 4 * np.pi * 4, rtol=0.01)
+
+
+def test_vertex_normals_of_a_sphere_point_outwards() -> None:
+    ball = sphere()
+    assert ((mesh.vertex_normals(ball) * ball.vertices / 2).sum(1) > np.cos(np.radians(0.5))).all()
+
+
+def test_degenerate_faces_do_not_spoil_normals() -> None:
+    ball = sphere(2)
+    spoiled = Surface(ball.vertices, np.concatenate([ball.faces, [[0, 0, 1], [2, 2, 2]]]))
+    assert np.allclose(mesh.vertex_normals(spoiled), mesh.vertex_normals(ball))
+
+
+def test_remeshing_reaches_the_edge_length_and_stays_closed_on_the_surface() -> None:
+    fine = mesh.isotropic_remesh(sphere(), 0.15)
+    assert abs(mesh.mean_edge_length(fine) - 0.15) < 0.02
+    assert mesh.is_closed(fine) and mesh.signed_volume(fine) > 0
+    assert np.abs(np.linalg.norm(fine.vertices, axis=1) - 2).max() < 0.02
+
+
+def test_largest_component_is_kept_and_unused_vertices_go() -> None:
+    big, small = sphere(3), sphere(1, 0.5)
+    both = Surface(np.concatenate([small.vertices + 9, big.vertices]), np.concatenate([small.faces, big.faces + len(small.vertices)]))
+    kept = mesh.largest_component(both)
+    assert len(kept.vertices) == len(big.vertices) and np.isclose(mesh.signed_volume(kept), mesh.signed_volume(big))
+
+
+def test_turning_the_faces_turns_the_volume_negative() -> None:
+    ball = sphere(2)
+    assert mesh.signed_volume(Surface(ball.vertices, ball.faces[:, ::-1])) < 0 < mesh.signed_volume(ball)

@@ -1,0 +1,80 @@
+"""Solvers: low rank, linear, bounded least squares."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from scipy.optimize import lsq_linear
+
+from solvers.least_squares import bounded_step
+from solvers.linear import CholeskyLike
+from solvers.low_rank import factorise, robust_weights, solve_rows
+
+
+def low_rank(seed: int, rows: int = 300, columns: int = 20) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(rows, 3)) @ rng.normal(size=(3, columns))
+
+
+def test_exact_matrix_with_missing_entries_is_recovered() -> None:
+    M = low_rank(0)
+    known = np.random.default_rng(1).random(M.shape) < 0.7
+    factors = factorise(np.where(known, M, 1e3), known, 3, sweeps=60)
+    assert np.abs(factors.left @ factors.right.T - M).max() < 1e-3 * np.abs(M).max()
+
+
+def test_outliers_are_outvoted() -> None:
+    M = low_rank(2)
+    rng = np.random.default_rng(3)
+    spoiled = np.where(rng.random(M.shape) < 0.05, M + 5, M)
+    factors = factorise(spoiled, np.ones(M.shape, bool), 3, sweeps=40, floor=1e-3)
+    plain_u, plain_s, plain_v = np.linalg.svd(spoiled, full_matrices=False)
+    plain = plain_u[:, :3] * plain_s[:3] @ plain_v[:3]
+    assert np.median(np.abs(factors.left @ factors.right.T - M)) < 0.05 * np.median(np.abs(plain - M))
+
+
+def test_fewer_columns_than_the_rank_are_refused() -> None:
+    with pytest.raises(ValueError, match="wanted at least 3 columns, given 2"):
+        factorise(np.ones((5, 2)), np.ones((5, 2), bool), 3)
+
+
+def test_rows_without_entries_solve_to_zero() -> None:
+    x = solve_rows(np.ones((2, 4)), np.array([[1.0] * 4, [0.0] * 4]), np.random.default_rng(0).normal(size=(4, 3)))
+    assert np.isfinite(x).all() and np.abs(x[1]).max() == 0
+
+
+def test_weights_fall_with_the_residual_and_unknown_entries_weigh_nothing() -> None:
+    weights = robust_weights(np.array([[0.0, 1.0, 2.0, 50.0, 1.0]]), np.array([[1.0, 1.0, 1.0, 1.0, 0.0]]), 0.1)[0]
+    assert weights[0] == 1 and (np.diff(weights[:4]) < 0).all() and weights[3] < 0.02 and weights[4] == 0
+
+
+def test_sparse_factor_solves_like_a_dense_one() -> None:
+    rng = np.random.default_rng(4)
+    B = sp.random(60, 60, 0.1, random_state=5)
+    A = (B @ B.T + sp.identity(60)).tocsc()
+    right = rng.normal(size=(60, 3))
+    assert np.allclose(CholeskyLike(A).solve(right), np.linalg.solve(A.toarray(), right), atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounded_step_lowers_the_objective_like_a_bounded_solver(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    J, r = rng.normal(size=(40, 5)), rng.normal(size=40)
+    x = np.abs(rng.normal(size=5))
+    lower = np.array([-np.inf, -np.inf, *-x[2:]])
+    exact = lsq_linear(J, -r, (lower, np.inf))
+    H, g = (torch.tensor(a, dtype=torch.float64)[None] for a in (J.T @ J, J.T @ r))
+    step = bounded_step(H, g, torch.tensor(lower)[None], damping=1e-9)[0].numpy()
+    assert (step >= lower - 1e-12).all()
+    start, best, reached = (0.5 * np.sum((J @ d + r) ** 2) for d in (np.zeros(5), exact.x, step))
+    # Fixing never releases a bound again, so the step may be a little short of the optimum, never worse than standing still.
+    assert best - 1e-9 <= reached <= start - 0.9 * (start - best)
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2])
+def test_rank_deficient_problems_give_finite_damped_steps(rank: int) -> None:
+    J = np.random.default_rng(7).normal(size=(30, 4)) * (np.arange(4) < rank)
+    r = np.ones(30)
+    H, g = (torch.tensor(a, dtype=torch.float32)[None] for a in (J.T @ J, J.T @ r))
+    step = bounded_step(H, g, torch.full((1, 4), -torch.inf))[0]
+    assert torch.isfinite(step).all() and step[rank:].abs().max() == 0
