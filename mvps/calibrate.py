@@ -13,7 +13,7 @@ Where the lights stand still in the camera's frame (one rig), all pixels of all 
 That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations.
 
 Views with fewer than MINIMUM_LIGHTS lights cannot be factorised; there the lights are the least-squares solution of I_pl = n_p . s_l
-for the rough shape's normals, each pixel scaled to a constant albedo by its mean over all views' lights.
+for the rough shape's normals, one albedo for the whole object (other albedos are outliers).
 """
 
 from __future__ import annotations
@@ -149,15 +149,16 @@ def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
 
 def _from_normals(sample: _Sampled) -> Float:
     """(lights, 3) least-squares lights for the rough shape's normals and one albedo: the case of few lights."""
-    lit = sample.known.astype(np.float64)
-    absolute = sample.image
+    # A pixel's own bright level says nothing of its albedo where few lights made it: radiance itself is used.
+    absolute = sample.image * sample.bright[:, None]
+    unsaturated = sample.known | (sample.image <= SHADOWED)
+    lit = (unsaturated & (absolute > SHADOWED * np.quantile(absolute, BRIGHT_QUANTILE, axis=0))).astype(np.float64)
     lights = solve_rows(absolute.T, lit.T, sample.normal)
     for _ in range(AMBIGUITY_SWEEPS):
         residual = absolute - sample.normal @ lights.T
-        weights = robust_weights(residual.T, lit.T, sample.noise)
+        weights = robust_weights(residual.T, lit.T, sample.noise * float(np.median(sample.bright)))
         lights = solve_rows(absolute.T, weights, sample.normal)
-    scaled: Float = lights * np.median(sample.bright)
-    return scaled
+    return lights
 
 
 def colour_ratios(view: View) -> Float:

@@ -1,0 +1,180 @@
+"""Hull, lights and photometric stereo: known answers on analytic scenes, and the data that must be refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
+
+from mvps.calibrate import solve_ambiguity, uncalibrated_lights
+from mvps.hull import bounds, default_cells, mask_distance, signed_distance, visual_hull
+from mvps.mesh import normalise
+from mvps.photometric import normal_map
+from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
+
+
+def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    return make_sphere(4)
+
+
+def discs(views: int, unit: float = 1.0, size: int = 160) -> Capture:
+    """Analytic silhouettes of a sphere of radius RADIUS * unit from many sides."""
+    rng = np.random.default_rng(0)
+    made = []
+    for k, direction in enumerate(normalise(rng.normal(size=(views, 3)))):
+        near = camera_at(direction, size)
+        camera = Camera(near.K, near.rotation, near.translation * unit, size, size)
+        # The cone that touches the sphere: its half-angle is asin(radius / distance).
+        half = near.K[0, 0] * np.tan(np.arcsin(RADIUS / 400.0))
+        row, column = np.indices((size, size)) + 0.5
+        mask = (column - size / 2) ** 2 + (row - size / 2) ** 2 < half**2
+        samples = np.ones((int(mask.sum()), 1, 3), np.uint16)
+        made.append(View(f"view_{k + 1:02d}", camera, mask, samples, 1.0, 65535, (1,)))
+    return Capture("discs", tuple(made))
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_hull_of_a_sphere_from_many_sides_is_the_sphere_in_any_unit(unit: float) -> None:
+    capture = discs(24, unit)
+    low, high = bounds(capture)
+    assert (low < -RADIUS * unit * 0.98).all() and (high > RADIUS * unit * 0.98).all() and (high - low < 3 * RADIUS * unit).all()
+    hull = visual_hull(signed_distance(capture, default_cells(capture)))
+    radius = np.linalg.norm(hull.vertices, axis=1) / unit
+    pixel = 2 * RADIUS / (0.8 * 160)
+    # Silhouettes touch the sphere; between them the hull bulges outwards.
+    assert radius.min() > RADIUS - 0.5 * pixel and np.median(radius) < RADIUS + pixel
+
+
+def test_distance_to_a_straight_mask_is_exact_and_half_a_pixel_from_the_centres() -> None:
+    mask = np.zeros((40, 40), bool)
+    mask[:, :20] = True
+    distance = mask_distance(mask)
+    assert np.allclose(distance[20, 10:30], np.arange(10, 30) + 0.5 - 20, atol=0.02)
+
+
+def test_one_view_bounds_nothing() -> None:
+    with pytest.raises(CaptureError, match="leave the object unbounded"):
+        bounds(discs(1))
+
+
+def test_masks_of_different_places_have_no_common_part() -> None:
+    capture = discs(6)
+    moved = [
+        replace(view, camera=Camera(view.camera.K, view.camera.rotation, view.camera.translation + (150.0 * k, 0, 0), 160, 160))
+        for k, view in enumerate(capture.views)
+    ]
+    with pytest.raises(CaptureError, match="wanted masks"):
+        signed_distance(Capture("apart", tuple(moved)), 32)
+
+
+def light_error(lights: Lights, truth: Lights) -> float:
+    return float(np.mean([degrees(a, b).mean() for a, b in zip(lights.direction, truth.direction, strict=True)]))
+
+
+def lambertian(scene: SphereScene, seed: int | None = None, right: float = 0.4) -> tuple[Capture, Lights, Surface]:
+    """The sphere without lobes, albedo 0.7 and `right`; with a seed, other lights in every view."""
+    reconstruction = scene.reconstruction
+    lights = reconstruction.lights
+    if seed is not None:
+        rng = np.random.default_rng(seed)
+        directions = [
+            normalise(np.concatenate([rng.normal(0, 0.5, (10, 2)), -np.ones((10, 1))], 1) @ view.camera.rotation) for view in scene.capture.views
+        ]
+        lights = Lights(tuple(directions), tuple(rng.uniform(0.6, 1.4, (10, 3)) for _ in directions), False)
+    views = []
+    for view, direction, intensity in zip(scene.capture.views, lights.direction, lights.intensity, strict=True):
+        seen = normalise(np.nan_to_num(ball_normals(view)))
+        shading = np.maximum(seen @ direction.T, 0)
+        albedo = np.where(view.pixels[:, 1:] < view.camera.width / 2, 0.7, right)
+        radiance = albedo[:, None] * shading[..., None] * intensity
+        views.append(replace(view, samples=np.rint(radiance / 2 * 65535).astype(np.uint16)))
+    return Capture("lambertian", tuple(views)), lights, reconstruction.surface
+
+
+def ball_normals(view: View) -> np.ndarray:
+    """Exact normals (pixels, 3) of the sphere under a view's pixels."""
+    from mvps.camera import pixel_centres, rays
+
+    origin, direction = rays(view.camera, pixel_centres(view.pixels))
+    along = -(origin * direction).sum(1)
+    miss = np.maximum(RADIUS**2 - ((origin + along[:, None] * direction) ** 2).sum(1), 0)
+    return (origin + (along - np.sqrt(miss))[:, None] * direction) / RADIUS
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_lights_of_a_lambertian_sphere_and_whether_one_rig_made_them(scene: SphereScene, seed: int | None) -> None:
+    capture, truth, surface = lambertian(scene, seed)
+    found = uncalibrated_lights(capture, surface, 0)
+    assert found.lights.one_rig == (seed is None)
+    assert light_error(found.lights, truth) < 1.0 and found.fourth_singular_value < 0.1
+
+
+def test_lights_survive_a_rough_shape_that_is_wrong_on_one_side(scene: SphereScene) -> None:
+    capture, truth, surface = lambertian(scene)
+    # A hull's bulge: one flank of the sphere is pushed flat, its normals wrong by up to 40 degrees.
+    squeezed = surface.vertices * np.where(surface.vertices[:, 1:2] > 0.5 * RADIUS, (1, 0.6, 1), (1, 1, 1))
+    assert light_error(uncalibrated_lights(capture, Surface(squeezed, surface.faces), 0).lights, truth) < 3.0
+
+
+def test_few_lights_on_one_albedo_are_solved_from_the_rough_normals(scene: SphereScene) -> None:
+    capture, truth, surface = lambertian(scene, right=0.7)
+    few = capture.select({view.name: (1, 2) for view in capture.views})
+    found = uncalibrated_lights(few, surface, 0).lights
+    assert np.mean([degrees(a, b[:2]).mean() for a, b in zip(found.direction, truth.direction, strict=True)]) < 2
+
+
+def test_ambiguity_is_undone_among_wrong_normals() -> None:
+    rng = np.random.default_rng(1)
+    normal = normalise(rng.normal(size=(800, 3)))
+    A = rng.normal(size=(3, 3)) + 2 * np.eye(3)
+    pseudo = normal * rng.uniform(0.3, 1, (800, 1)) @ np.linalg.inv(A).T
+    wrong = normal.copy()
+    wrong[::6] = normalise(rng.normal(size=wrong[::6].shape))
+    solved = solve_ambiguity(pseudo, wrong, np.ones(800))
+    assert degrees(normalise(pseudo @ solved.T), normal).max() < 0.1
+
+
+def test_normals_in_one_plane_fix_no_ambiguity() -> None:
+    angle = np.linspace(0, np.pi, 50)
+    normal = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    with pytest.raises(np.linalg.LinAlgError, match="span no volume"):
+        solve_ambiguity(normal, normal, np.ones(50))
+
+
+def test_photometric_stereo_of_a_lambertian_sphere(scene: SphereScene) -> None:
+    capture, lights, _ = lambertian(scene)
+    view = capture.views[0]
+    maps = normal_map(view, lights.direction[0], lights.intensity[0])
+    error = degrees(maps.normal, ball_normals(view))
+    assert np.median(error) < 0.1 and np.quantile(error, 0.9) < 2
+    expected = np.where(view.pixels[:, 1:] < view.camera.width / 2, 0.7, 0.4)
+    sure = maps.confidence > 0.9
+    assert sure.mean() > 0.7 and np.abs(maps.albedo - expected)[sure].max() < 0.02
+
+
+def test_shadows_highlights_and_saturation_are_outvoted(scene: SphereScene) -> None:
+    capture, lights, _ = lambertian(scene)
+    view = capture.views[0]
+    spoiled = view.samples.copy()
+    spoiled[:, 0] = 0  # one light blocked everywhere
+    spoiled[:, 1] = np.minimum(spoiled[:, 1].astype(int) * 2 + 8000, 65534)  # one with a highlight everywhere
+    spoiled[:, 2] = 65535  # one saturated
+    maps = normal_map(replace(view, samples=spoiled), lights.direction[0], lights.intensity[0])
+    assert np.median(degrees(maps.normal, ball_normals(view))) < 0.5
+
+
+def test_a_dark_pixel_faces_the_camera_without_confidence(scene: SphereScene) -> None:
+    capture, lights, _ = lambertian(scene)
+    view = capture.views[0]
+    black = view.samples.copy()
+    black[:5] = 0
+    maps = normal_map(replace(view, samples=black), lights.direction[0], lights.intensity[0])
+    assert (maps.confidence[:5] == 0).all() and (degrees(maps.normal[:5], -view.camera.rotation[2]) < 15).all()
+    assert np.isfinite(maps.albedo).all()

@@ -1,0 +1,142 @@
+"""The whole way through the command line, on a small embedded capture and on a real one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from mvps import evaluate, reconstruct
+from mvps.command import run
+from mvps.export import read_reconstruction
+from mvps.synthetic.files import write_capture
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+COMPARED = ("mesh.ply", "material.npz", "lights.json", "model.glb", "model.obj", "normals/view_01.npy", "normals/view_03.npy")
+"""Files without times or paths in them."""
+
+
+def reconstructed(capture: Path, out: Path, *options: str) -> Path:
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--preset", "draft", "--quiet", *options]) == 0
+    return out
+
+
+def figures(result: Path, capture: Path) -> dict[str, float]:
+    assert run(evaluate.main, [str(result), "--truth", str(capture), "--quiet"]) == 0
+    truth: dict[str, float] = json.loads((result / "metrics.json").read_text())["truth"]
+    return truth
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture") / "small"
+    write_capture(*render_capture(SceneSettings(views=8, lights=10, size=96)), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return reconstructed(capture, tmp_path_factory.mktemp("result") / "small")
+
+
+def test_figures_of_the_embedded_capture(capture: Path, result: Path) -> None:
+    found = figures(result, capture)
+    assert found["light_error_deg"] < 0.8 and found["intensity_error"] < 0.015
+    assert found["map_normal_error_deg"] < 2.5 and found["mesh_normal_error_deg"] < 4.5
+    assert found["chamfer_px"] < 0.35 and abs(found["offset_px"]) < 0.2
+    # The report is renewed with the figures.
+    assert "ground truth" in (result / "report.html").read_text().lower()
+
+
+def test_all_files_of_a_result_are_there_and_read_back(capture: Path, result: Path) -> None:
+    names = {path.name for path in result.iterdir()}
+    assert {"mesh.ply", "model.glb", "model.obj", "model.mtl", "lights.json", "material.npz", "report.html"} <= names
+    assert {"normals", "metrics.json", "settings.json"} <= names
+    assert len(list((result / "normals").glob("view_*.npy"))) == 8 == len(list((result / "normals").glob("view_*.png")))
+    read = read_reconstruction(result)
+    assert read.views == tuple(f"view_{k:02d}" for k in range(1, 9)) and read.metrics["status"]["text"]
+    assert {stage["name"] for stage in read.metrics["stages"]} >= {"load", "visual hull", "occupancy field", "joint refinement", "textures"}
+    assert read.settings["preset"] == "draft" and "torch" in read.settings["versions"]
+
+
+def test_without_ground_truth_the_same_bytes_come_out(capture: Path, result: Path, tmp_path: Path) -> None:
+    blind = tmp_path / "small"
+    shutil.copytree(capture, blind)
+    deleted = [path for pattern in ("light_*.txt", "Normal_gt.mat", "mesh_Gt.ply") for path in blind.rglob(pattern)]
+    assert len(deleted) == 3 * 8 + 1
+    for path in deleted:
+        path.unlink()
+    again = reconstructed(blind, tmp_path / "result")
+    assert [name for name in COMPARED if (again / name).read_bytes() != (result / name).read_bytes()] == []
+
+
+def moved(capture: Path, folder: Path, rotation: np.ndarray, shift: np.ndarray, unit: float) -> Path:
+    """The capture in another world: x' = unit * (rotation x + shift). Only the calibration changes."""
+    shutil.copytree(capture, folder)
+    data = {k: v for k, v in scipy.io.loadmat(capture / "Calib_Results.mat").items() if not k.startswith("__")}
+    for k in range(1, 9):
+        R, t = data[f"Rc_{k}"], data[f"Tc_{k}"].reshape(3)
+        data[f"Rc_{k}"] = R @ rotation.T
+        data[f"Tc_{k}"] = (unit * (t - R @ rotation.T @ shift)).reshape(3, 1)
+    scipy.io.savemat(folder / "Calib_Results.mat", data)
+    return folder
+
+
+TURN = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+TURN = TURN * np.sign(np.linalg.det(TURN))
+
+
+@pytest.mark.parametrize(("rotation", "shift", "unit"), [(TURN, np.array([300.0, -90.0, 40.0]), 1.0), (np.eye(3), np.zeros(3), 1e-3)])
+def test_the_frame_and_the_unit_of_the_world_do_not_matter(
+    capture: Path, result: Path, tmp_path: Path, rotation: np.ndarray, shift: np.ndarray, unit: float
+) -> None:
+    elsewhere = reconstructed(moved(capture, tmp_path / "capture", rotation, shift, unit), tmp_path / "result")
+    here, there = read_reconstruction(result), read_reconstruction(elsewhere)
+    back = (there.surface.vertices / unit - shift) @ rotation
+    span = np.ptp(here.surface.vertices, axis=0)
+    # Grids lie along other axes, so meshes differ in their vertices but not in what they show.
+    assert np.abs(back.min(0) - here.surface.vertices.min(0)).max() < 0.01 * span.max()
+    assert np.abs(np.ptp(back, axis=0) - span).max() < 0.01 * span.max()
+    for a, b in zip(here.lights.direction, there.lights.direction, strict=True):
+        assert np.degrees(np.arccos(np.clip((a * (b @ rotation)).sum(1), -1, 1))).max() < 0.6
+    difference = [(a * (b @ rotation)).sum(-1) for a, b in zip(here.normal_maps, there.normal_maps, strict=True)]
+    assert np.degrees(np.arccos(np.clip(np.nanmedian(np.concatenate([d.ravel() for d in difference])), -1, 1))) < 0.6
+
+
+def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
+    out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9")
+    found = figures(out, capture)
+    assert found["held_out_views_psnr_db"] > 24 and found["held_out_lights_psnr_db"] > 24
+    assert found["held_out_map_normal_error_deg" if "held_out_map_normal_error_deg" in found else "map_held_out_normal_error_deg"] < 8
+    assert len(read_reconstruction(out).light_names[0]) == 10
+
+
+def test_given_lights_are_taken_as_they_are(capture: Path, tmp_path: Path) -> None:
+    out = reconstructed(capture, tmp_path / "given", "--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8")
+    read = read_reconstruction(out)
+    assert read.views == tuple(f"view_{k:02d}" for k in (1, 2, 3, 5, 6, 7)) and read.light_names[0] == (1, 2, 4, 5, 7, 8)
+    found = figures(out, capture)
+    assert found["light_error_deg"] < 0.01
+
+
+def test_bad_input_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "none"
+    assert run(reconstruct.main, [str(tmp_path / "nowhere"), "--out", str(out)]) == 2
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--views", "1,77", "--quiet"]) == 2
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--hold-out-views", "1,2,3,4,5,6,7,8", "--quiet"]) == 2
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--views", "1", "--quiet"]) == 2
+    said = capsys.readouterr().err
+    assert all(line.startswith("mvps: ") for line in said.strip().splitlines() if "wanted" in line) and said.count("wanted") == 4
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bunny_at_a_quarter_of_its_lights(captures: Path, tmp_path: Path) -> None:
+    out = reconstructed(captures / "bunny", tmp_path / "bunny", "--lights", "1,5,9,13,17,21,25,29")
+    found = figures(out, captures / "bunny")
+    assert found["light_error_deg"] < 1.2 and found["intensity_error"] < 0.012
+    assert found["map_normal_error_deg"] < 4.5 and found["chamfer_px"] < 0.4

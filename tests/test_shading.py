@@ -1,0 +1,57 @@
+"""The image model: laws of the shading formula."""
+
+import torch
+
+from mvps.shading import half_dot_normal, lobes, shade
+
+N = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def unit(*values: float) -> torch.Tensor:
+    return torch.nn.functional.normalize(torch.tensor([values], dtype=torch.float64), dim=1)
+
+
+def shaded(view: torch.Tensor, light: torch.Tensor, weight: float = 0.5, sharpness: float = 30.0) -> torch.Tensor:
+    albedo = torch.tensor([[0.2, 0.3, 0.4]], dtype=torch.float64)
+    return shade(N, view, light, albedo, torch.tensor([[weight]], dtype=torch.float64), torch.tensor([sharpness], dtype=torch.float64))[0, 0]
+
+
+def test_attached_shadow_is_black() -> None:
+    assert (shaded(unit(0, 0, 1), unit(1, 0, -0.01)) == 0).all()
+
+
+def test_lobe_peaks_at_its_weight_where_the_half_vector_is_the_normal() -> None:
+    view, light = unit(0.5, 0, 1), unit(-0.5, 0, 1)
+    expected = (torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64) + 0.5) * light[0, 2]
+    assert torch.allclose(shaded(view, light), expected)
+    assert (shaded(view, unit(-0.4, 0, 1)) / unit(-0.4, 0, 1)[0, 2] < expected / light[0, 2]).all()
+
+
+def test_reflectance_is_reciprocal() -> None:
+    a, b = unit(0.3, 0.4, 1), unit(-0.7, 0.1, 0.6)
+    assert torch.allclose(shaded(a, b) / b[0, 2], shaded(b, a) / a[0, 2])
+
+
+def test_opposite_view_and_light_stay_finite() -> None:
+    assert torch.isfinite(shaded(unit(1, 0, 0.001), unit(-1, 0, -0.001))).all()
+
+
+def test_half_vector_against_its_definition() -> None:
+    view, light = unit(0.2, -0.5, 1), unit(-0.6, 0.3, 0.8)
+    half = torch.nn.functional.normalize(view + light, dim=1)
+    assert torch.allclose(half_dot_normal((N * view).sum(-1, keepdim=True), N @ light.T, view @ light.T), N @ half.T)
+    assert torch.allclose(lobes(torch.ones(3, dtype=torch.float64), torch.tensor([5.0, 50.0], dtype=torch.float64)), torch.ones(3, 2, dtype=torch.float64))
+
+
+def test_gradients_against_finite_differences() -> None:
+    generator = torch.Generator().manual_seed(0)
+    normal, view, light = (torch.randn(2, 3, dtype=torch.float64, generator=generator) for _ in range(3))
+    inputs = [normal + 3 * N, view + 3 * N, light + 3 * N, torch.rand(2, 3, dtype=torch.float64), torch.rand(2, 2, dtype=torch.float64)]
+    inputs = [x.requires_grad_() for x in inputs]
+    sharpness = torch.tensor([3.0, 8.0], dtype=torch.float64)
+
+    def image(n: torch.Tensor, v: torch.Tensor, light: torch.Tensor, a: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
+        n, v, light = (torch.nn.functional.normalize(x, dim=1) for x in (n, v, light))
+        return shade(n, v, light, a, w, sharpness)
+
+    assert torch.autograd.gradcheck(image, inputs)
