@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from mvps.camera import pixel_centres, rays
@@ -64,7 +64,7 @@ def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre
 
 def ring_pixels(mask: Bool, ring: int) -> Int:
     """(n, 2) row and column of the pixels within `ring` pixels of the mask's boundary, on either side."""
-    inside, outside = (cv2.distanceTransform(m.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE) for m in (mask, ~mask))
+    inside, outside = distance_transform_edt(mask), distance_transform_edt(~mask)
     return np.argwhere(inside + outside < ring + 0.5)
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.optimize import linprog
 from skimage.measure import marching_cubes
 
@@ -37,11 +38,11 @@ MINIMUM_CELLS_ACROSS = 8
 
 def mask_distance(mask: Bool) -> NDArray[np.float32]:
     """(height, width) signed distance in pixels from pixel centres to the mask's boundary, negative inside."""
-    inside = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    outside = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    signed: NDArray[np.float32] = np.where(mask, 0.5 - inside, outside - 0.5).astype(np.float32)
-    smooth = cv2.GaussianBlur(signed, (0, 0), STAIRCASE_PIXELS, borderType=cv2.BORDER_REPLICATE)
-    return smooth.astype(np.float32)
+    # scipy rather than OpenCV, whose blur and distance differ in the last bits from call to call.
+    inside, outside = distance_transform_edt(mask), distance_transform_edt(~mask)
+    signed = np.where(mask, 0.5 - inside, outside - 0.5)
+    smooth: NDArray[np.float32] = gaussian_filter(signed, STAIRCASE_PIXELS, mode="nearest").astype(np.float32)
+    return smooth
 
 
 def bounds(capture: Capture) -> tuple[Float, Float]:

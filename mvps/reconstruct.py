@@ -81,15 +81,6 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     return used, capture.select(rest) if rest else None
 
 
-def chosen_device(device: str) -> str:
-    """ "cpu" or "cuda" for auto, cpu or cuda; CaptureError where cuda is asked for and not there."""
-    import torch
-
-    if device == "cuda" and not torch.cuda.is_available():
-        raise CaptureError("--device: wanted a CUDA device, given a machine on which torch finds none; use --device cpu or auto")
-    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-
-
 def photometric_stereo(capture: Capture, lights: Lights) -> tuple[NormalMap, ...]:
     """Photometric stereo of every view on its own, on all cores."""
     import os
@@ -146,7 +137,7 @@ def stage_two(
     progress: Progress,
 ) -> Refined:
     """Rounds of Stage II under the progress bar."""
-    from mvps.joint.refine import refine
+    from mvps.joint.refine import chosen_device, refine
 
     with progress.stage(name, total=len(plan.rounds)) as stage:
 

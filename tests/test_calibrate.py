@@ -67,7 +67,7 @@ def test_one_view_bounds_nothing() -> None:
 def test_masks_of_different_places_have_no_common_part() -> None:
     capture = discs(6)
     moved = [
-        replace(view, camera=Camera(view.camera.K, view.camera.rotation, view.camera.translation + (150.0 * k, 0, 0), 160, 160))
+        replace(view, camera=Camera(view.camera.K, view.camera.rotation, view.camera.translation + np.array([150.0 * k, 0, 0]), 160, 160))
         for k, view in enumerate(capture.views)
     ]
     with pytest.raises(CaptureError, match="wanted masks"):
@@ -85,7 +85,8 @@ def lambertian(scene: SphereScene, seed: int | None = None, right: float = 0.4) 
     if seed is not None:
         rng = np.random.default_rng(seed)
         directions = [
-            normalise(np.concatenate([rng.normal(0, 0.5, (10, 2)), -np.ones((10, 1))], 1) @ view.camera.rotation) for view in scene.capture.views
+            normalise(np.concatenate([rng.normal(0, 0.5, (10, 2)), -np.ones((10, 1))], 1) @ view.camera.rotation)
+            for view in scene.capture.views
         ]
         lights = Lights(tuple(directions), tuple(rng.uniform(0.6, 1.4, (10, 3)) for _ in directions), False)
     views = []

@@ -132,7 +132,10 @@ def test_lights_stay_at_the_truth_and_come_back_to_it(scene: SphereScene, start:
     rotations_ = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
     lights = turned(truth, start)
     if one_rig:
-        lights = [DirectionalLights(lights[0].direction @ rotations_[0].T @ r, of_view.intensity) for r, of_view in zip(rotations_, truth, strict=True)]
+        lights = [
+            DirectionalLights(lights[0].direction @ rotations_[0].T @ r, of_view.intensity)
+            for r, of_view in zip(rotations_, truth, strict=True)
+        ]
     # The anchor is the smooth sphere: true on average, some degrees off at every vertex.
     anchor = free_reflectance(torch.tensor(vertex_normals(scene.reconstruction.surface), dtype=torch.float32), 0.05, 3)
     for _ in range(8):
@@ -162,7 +165,10 @@ def test_pixels_keep_the_normals_that_explain_them(scene: SphereScene) -> None:
         degrees(m.normal, truth[view.mask]) for m, truth, view in zip(maps, reconstruction.normal_maps, scene.capture.views, strict=True)
     ]
     assert np.median(np.concatenate(errors)) < 0.5
-    smooth = Material(vertex_normals(reconstruction.surface), *(getattr(reconstruction.material, k) for k in ("albedo", "specular_weight", "sharpness", "confidence")))
+    smooth = Material(
+        vertex_normals(reconstruction.surface),
+        *(getattr(reconstruction.material, k) for k in ("albedo", "specular_weight", "sharpness", "confidence")),
+    )
     again = all_pixel_normals(scene.capture, reconstruction.surface, smooth, reconstruction.lights)
     errors = [
         degrees(m.normal, truth[view.mask]) for m, truth, view in zip(again, reconstruction.normal_maps, scene.capture.views, strict=True)

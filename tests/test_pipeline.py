@@ -111,8 +111,9 @@ def test_the_frame_and_the_unit_of_the_world_do_not_matter(
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
     out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9")
     found = figures(out, capture)
-    assert found["held_out_views_psnr_db"] > 24 and found["held_out_lights_psnr_db"] > 24
-    assert found["held_out_map_normal_error_deg" if "held_out_map_normal_error_deg" in found else "map_held_out_normal_error_deg"] < 8
+    # A view from 45 degrees aside, of an object with patches whose edges one pixel of error moves: 26 dB and 32 dB measured.
+    assert found["held_out_views_psnr_db"] > 23 and found["held_out_lights_psnr_db"] > 28
+    assert found["map_held_out_normal_error_deg"] < 8
     assert len(read_reconstruction(out).light_names[0]) == 10
 
 

@@ -13,7 +13,9 @@ def unit(*values: float) -> torch.Tensor:
 
 def shaded(view: torch.Tensor, light: torch.Tensor, weight: float = 0.5, sharpness: float = 30.0) -> torch.Tensor:
     albedo = torch.tensor([[0.2, 0.3, 0.4]], dtype=torch.float64)
-    return shade(N, view, light, albedo, torch.tensor([[weight]], dtype=torch.float64), torch.tensor([sharpness], dtype=torch.float64))[0, 0]
+    return shade(N, view, light, albedo, torch.tensor([[weight]], dtype=torch.float64), torch.tensor([sharpness], dtype=torch.float64))[
+        0, 0
+    ]
 
 
 def test_attached_shadow_is_black() -> None:
@@ -40,7 +42,9 @@ def test_half_vector_against_its_definition() -> None:
     view, light = unit(0.2, -0.5, 1), unit(-0.6, 0.3, 0.8)
     half = torch.nn.functional.normalize(view + light, dim=1)
     assert torch.allclose(half_dot_normal((N * view).sum(-1, keepdim=True), N @ light.T, view @ light.T), N @ half.T)
-    assert torch.allclose(lobes(torch.ones(3, dtype=torch.float64), torch.tensor([5.0, 50.0], dtype=torch.float64)), torch.ones(3, 2, dtype=torch.float64))
+    assert torch.allclose(
+        lobes(torch.ones(3, dtype=torch.float64), torch.tensor([5.0, 50.0], dtype=torch.float64)), torch.ones(3, 2, dtype=torch.float64)
+    )
 
 
 def test_gradients_against_finite_differences() -> None:

@@ -23,10 +23,10 @@ from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import colours
-from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step
+from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step, with_population
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
-from mvps.scene import Capture, Float, Lights, Material, NormalMap, Surface
+from mvps.scene import Capture, CaptureError, Float, Lights, Material, NormalMap, Surface
 from solvers.low_rank import MAD_TO_SIGMA
 
 SHARPNESS = (8.0, 32.0, 128.0)
@@ -100,6 +100,13 @@ class _State:
     maps_lights: Lights
     vertices: Vertices | None = None
     views: list[ViewSamples] = field(default_factory=list)
+
+
+def chosen_device(device: str) -> str:
+    """ "cpu" or "cuda" for auto, cpu or cuda; CaptureError where cuda is asked for and not there."""
+    if device == "cuda" and not torch.cuda.is_available():
+        raise CaptureError("--device: wanted a CUDA device, given a machine on which torch finds none; use --device cpu or auto")
+    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
 def _tensor(values: Any, device: torch.device) -> torch.Tensor:
@@ -208,6 +215,7 @@ def _photometric_round(
     lights = grey_lights(state.lights, device)
     for _ in range(MATERIAL_STEPS):
         vertices = vertex_step(state.views, vertices, lights, sharpness, free)
+    free = with_population(state.views, vertices, lights, sharpness, free)
     moved = (0.0, 0.0)
     if settings.free_lights:
         deviation = np.median(np.linalg.norm(vertices.normal.cpu().numpy() - mesh_normal, axis=1))

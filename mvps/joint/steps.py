@@ -45,6 +45,23 @@ def free_reflectance(normal: Tensor, sigma: float, unknowns: int) -> Anchor:
     return Anchor(normal, sigma, nothing, nothing + torch.inf)
 
 
+def with_population(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor
+) -> Anchor:
+    """The anchor with every lobe's weight tied to the object's: mean and standard deviation over the vertices, each by what its samples say
+    of that lobe (empirical Bayes). A lobe that no light has excited at a vertex would otherwise be free, and blaze under another light."""
+    equations = vertex_equations(views, vertices, lights, sharpness)
+    said = torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:].double()
+    share = said / said.sum(0).clamp_min(1e-300)
+    mean = (share * vertices.reflectance).sum(0)
+    sigma = (share * (vertices.reflectance - mean) ** 2).sum(0).sqrt()
+    # An object without this lobe shows no spread either; rounding must not turn that into certainty.
+    sigma = sigma.clamp_min(1e-3 * float(mean[0]))
+    sigma[0] = torch.inf
+    like = vertices.reflectance
+    return replace(anchor, reflectance=mean.to(like).expand_as(like), reflectance_sigma=sigma.to(like).expand_as(like))
+
+
 def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> None:
     """Adds the ties to the normal equations, in place."""
     unit = equations.count * vertices.scale**2
