@@ -4,7 +4,8 @@
     model.glb                textured physically based model;  model.obj, .mtl and textures likewise   (where textures are given)
     lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
-    material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,)
+    material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
+                             grazing, bounce (numbers)
     normals/NAME.npy, .png   (height, width, 3) float32 world frame, NaN outside the mask; the picture shows (normal + 1) / 2
     report.html              where one is given
     metrics.json, settings.json
@@ -75,7 +76,8 @@ def read_reconstruction(folder: Path) -> Reconstruction:
     views = tuple(record["views"])
     try:
         with np.load(folder / "material.npz") as arrays:
-            material = Material(normal=mesh.normals, **{name: arrays[name] for name in _MATERIAL})
+            values = {name: arrays[name] for name in _MATERIAL} | {name: float(arrays[name]) for name in _OF_ALL}
+            material = Material(normal=mesh.normals, **values)
         return Reconstruction(
             surface=Surface(mesh.vertices, mesh.faces),
             material=material,
@@ -95,6 +97,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
 
 
 _MATERIAL = ("albedo", "specular_weight", "sharpness", "confidence")
+_OF_ALL = ("grazing", "bounce")
 
 
 def normal_picture(normals: Float) -> Any:
@@ -144,7 +147,7 @@ def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
     colours = srgb_bytes(material.albedo / scale)
     mesh = PlyMesh(surface.vertices, material.normal, colours, surface.faces)
     arrays = io.BytesIO()
-    np.savez(arrays, allow_pickle=False, **{name: getattr(material, name) for name in _MATERIAL})
+    np.savez(arrays, allow_pickle=False, **{name: getattr(material, name) for name in _MATERIAL + _OF_ALL})
     comment = f"colour = sRGB of albedo / {scale:.9g}; the normal is the refined shading normal"
     return {"mesh.ply": ply_bytes(mesh, comment), "material.npz": arrays.getvalue()}
 

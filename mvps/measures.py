@@ -197,15 +197,16 @@ def photograph_errors(
     held-out views, the others as held-out lights. Photographs that the capture lacks are left out. One scale serves all of
     them and is reported as photograph_scale: intensities are relative, so it need not be 1.
     """
-    from mvps.rendering import photograph
+    from mvps.rendering import light_arriving, light_sources, photograph
 
-    caster, offset = RayCaster(surface), mean_edge_length(surface)
+    caster, offset, sources = RayCaster(surface), mean_edge_length(surface), light_sources(surface, material)
     pairs: list[tuple[View, Any, Any, Any]] = []
     for view in capture.views:
         kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]
         if kept:
             direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
-            rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset)
+            arriving = light_arriving(sources, material, direction)
+            rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset, arriving)
             pairs.append((view, rendered, view.radiance(kept), view.usable(kept)))
     if not pairs:
         return {}

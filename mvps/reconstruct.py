@@ -9,14 +9,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mvps import __version__
 from mvps.command import lights_argument, number_list, parse, parser, run
 from mvps.progress import Progress
-from mvps.scene import Capture, CaptureError, Lights, NormalMap, Reconstruction
+from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
 if TYPE_CHECKING:
     from mvps.joint.refine import Refined, RefineSettings
@@ -132,6 +131,7 @@ def stage_two(
     surface: Surface,
     lights: Lights,
     maps: tuple[NormalMap, ...],
+    law: Law,
     plan: RefineSettings,
     settings: Settings,
     progress: Progress,
@@ -145,8 +145,7 @@ def stage_two(
             stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
 
         device = chosen_device(settings.device)
-        again = partial(photometric_stereo, capture)
-        refined = refine(capture, surface, lights, maps, again, plan, settings.seed, device, on_round)
+        refined = refine(capture, surface, lights, maps, law, plan, settings.seed, device, on_round)
         stage.status(refined.status)
     return refined
 
@@ -218,17 +217,17 @@ def versions() -> dict[str, str]:
 
 def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them."""
+    from mvps.joint.refine import SHARPNESS
+
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     grid, surface = rough_shape(used, progress)
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
         maps = photometric_stereo(used, start)
-    rough = stage_two("first refinement", used, surface, start, maps, first_pass(lights is None), settings, progress)
-    with progress.stage("photometric stereo again"):
-        maps = photometric_stereo(used, rough.lights)
-    surface = stage_one(used, grid, maps, settings, progress)
+    rough = stage_two("first refinement", used, surface, start, maps, Law(SHARPNESS), first_pass(lights is None), settings, progress)
+    surface = stage_one(used, grid, rough.maps, settings, progress)
     plan = second_pass(settings.preset, lights is None)
-    refined = stage_two("joint refinement", used, surface, rough.lights, maps, plan, settings, progress)
+    refined = stage_two("joint refinement", used, surface, rough.lights, rough.maps, rough.law, plan, settings, progress)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined)
         pictures = normal_pictures(capture, used, refined)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from mvps.bounce import Sources
     from mvps.scene import Camera, Reconstruction
     from mvps.visibility import RayCaster
 
@@ -27,16 +28,16 @@ SAMPLES_PER_CHUNK = 1 << 22
 
 
 def render_view(
-    caster: RayCaster, reconstruction: Reconstruction, view: str, camera: Camera
+    caster: RayCaster, reconstruction: Reconstruction, view: str, camera: Camera, sources: Sources | None = None
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
     """Code values (height, width, lights, 3) of a view of the result under its lights, and where the surface is (height, width).
 
-    CaptureError where the result has no such view.
+    sources: what sends light to other parts (rendering.light_sources). CaptureError where the result has no such view.
     """
     import numpy as np
 
     from mvps.mesh import mean_edge_length
-    from mvps.rendering import photograph
+    from mvps.rendering import light_arriving, photograph
     from mvps.scene import CaptureError
     from mvps.visibility import camera_hits
 
@@ -49,10 +50,11 @@ def render_view(
     hit = camera_hits(caster, camera, every).face >= 0
     image = np.zeros((len(every), len(direction), 3), np.uint16)
     chosen = np.flatnonzero(hit)
+    arriving = light_arriving(sources, reconstruction.material, direction)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(chosen), step):
         part = chosen[start : start + step]
-        radiance = photograph(caster, reconstruction.material, camera, every[part], direction, intensity, offset)
+        radiance = photograph(caster, reconstruction.material, camera, every[part], direction, intensity, offset, arriving)
         image[part] = np.rint((radiance * WHITE).clip(0, WHITE)).astype(np.uint16)
     return image.reshape(camera.height, camera.width, -1, 3), hit.reshape(camera.height, camera.width)
 
@@ -65,6 +67,7 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
     from mvps.folders import appearing_whole
     from mvps.load import read_capture
     from mvps.progress import Progress
+    from mvps.rendering import light_sources
     from mvps.scene import CaptureError
     from mvps.texture import png_bytes
     from mvps.visibility import RayCaster
@@ -77,10 +80,10 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
         raise CaptureError(
             f"{capture}: wanted the capture of the result's {', '.join(reconstruction.views)}, given one without these views"
         )
-    caster = RayCaster(reconstruction.surface)
+    caster, sources = RayCaster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
     with appearing_whole(out) as writing, Progress().stage("render", total=len(chosen)) as stage:
         for view in chosen:
-            image, mask = render_view(caster, reconstruction, view.name, view.camera)
+            image, mask = render_view(caster, reconstruction, view.name, view.camera, sources)
             folder = writing / view.name
             folder.mkdir()
             (folder / "mask.png").write_bytes(png_bytes(np.where(mask, 255, 0).astype(np.uint8)))

@@ -1,6 +1,8 @@
 """Photographs of a reconstruction: first hits, interpolated material, the image model, cast shadows.
 
-    image(pixel, light) = intensity * shade(material at the first hit) * (1 - cast_shadow)
+    image(pixel, light) = intensity * (shade(material at the first hit) * (1 - cast_shadow) + albedo * bounce * G)
+
+G is the light that other surfaces send (bounce.py).
 
 The shading normal is the material's refined normal; shadows are traced on the mesh.
 """
@@ -13,9 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvps.bounce import Sources, at, coarse_sources, gathered
 from mvps.camera import view_directions
 from mvps.mesh import normalise
-from mvps.scene import Bool, Camera, Float, Int, Material
+from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
 from mvps.shading import shade
 from mvps.visibility import RayCaster, camera_hits, interpolate
 
@@ -52,6 +55,38 @@ def shadow_at(caster: RayCaster, points: Points, lights: Float, offset: float) -
     return shadow
 
 
+class Arriving(NamedTuple):
+    """Light that other surfaces send (bounce.py) under some lights: its sources, and bounce * G (n, lights, 3) on them."""
+
+    sources: Sources
+    G: NDArray[np.float32]
+
+    def at(self, points: Float, normal: Float) -> NDArray[np.float32]:
+        """(points, lights, 3), per unit albedo and intensity, at points with normals (points, 3)."""
+        return at(self.sources, self.G, points, normal)
+
+
+def light_sources(surface: Surface, material: Material) -> Sources | None:
+    """What sends light to other parts of the surface; None where the material has no inter-reflection."""
+    return coarse_sources(surface, material.albedo) if material.bounce else None
+
+
+def light_arriving(sources: Sources | None, material: Material, direction: Float) -> Arriving | None:
+    """What arrives from `sources` under lights direction (lights, 3)."""
+    if sources is None:
+        return None
+    return Arriving(sources, np.float32(material.bounce) * gathered(sources, direction, material.bounce))
+
+
+def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: float) -> NDArray[np.float32]:
+    """(n, lights) radiance over albedo and intensity of the diffuse part (shading.py); normal, towards (n, 3), direction (lights, 3)."""
+    matt = Law((), grazing)
+    white, nothing = torch.ones(len(normal), 1), torch.zeros(len(normal), 0)
+    n, v, light = (torch.tensor(a, dtype=torch.float32) for a in (normal, towards, direction))
+    shaded: NDArray[np.float32] = shade(n, v, light, white, nothing, matt)[..., 0].numpy()
+    return shaded
+
+
 def photograph(
     caster: RayCaster,
     material: Material,
@@ -60,19 +95,24 @@ def photograph(
     direction: Float,
     intensity: Float,
     offset: float,
+    arriving: Arriving | None = None,
 ) -> NDArray[np.float32]:
-    """Radiance (n, lights, 3) at the centres of pixels (n, 2) under lights direction, intensity (lights, 3); 0 where nothing is hit."""
+    """Radiance (n, lights, 3) at the centres of pixels (n, 2) under lights direction, intensity (lights, 3); 0 where nothing is hit.
+
+    offset: see visibility.py; arriving: inter-reflection under the same lights.
+    """
     points = points_under(caster, material, camera, pixels)
     view = view_directions(camera, points.position)
     lit = ~shadow_at(caster, points, direction, offset)
     image = np.empty((len(pixels), len(direction), 3), np.float32)
     light = torch.tensor(direction, dtype=torch.float32)
-    sharpness = torch.tensor(material.sharpness, dtype=torch.float32)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(pixels), step):
         part = slice(start, start + step)
         arrays = (points.normal, view, points.albedo, points.specular_weight)
         normal, towards, albedo, weight = (torch.tensor(a[part], dtype=torch.float32) for a in arrays)
-        shaded = shade(normal, towards, light, albedo, weight, sharpness).numpy()
-        image[part] = shaded * intensity.astype(np.float32) * lit[part, :, None]
-    return image
+        shaded = shade(normal, towards, light, albedo, weight, material.law).numpy()
+        image[part] = shaded * lit[part, :, None]
+        if arriving is not None:
+            image[part] += points.albedo[part, None].astype(np.float32) * arriving.at(points.position[part], points.mesh_normal[part])
+    return image * intensity.astype(np.float32)

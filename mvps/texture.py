@@ -30,7 +30,7 @@ from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tan
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
 from mvps.mesh import face_areas, mean_edge_length, normalise, vertex_normals
 from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
-from mvps.rendering import photograph, points_under
+from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, photograph, points_under
 from mvps.scene import Bool, Capture, Float, Lights, Material, Surface, View
 from mvps.visibility import RayCaster
 
@@ -113,7 +113,13 @@ def png_bytes(image: NDArray[Any]) -> bytes:
 
 
 def pixel_albedo(
-    caster: RayCaster, material: Material, view: View, direction: Float, intensity: Float, offset: float
+    caster: RayCaster,
+    material: Material,
+    view: View,
+    direction: Float,
+    intensity: Float,
+    offset: float,
+    arriving: Arriving | None = None,
 ) -> tuple[Float, NDArray[np.float32], Bool]:
     """What the pixels of a view say of the albedo: first hits (pixels, 3), albedo (pixels, 3), and where there is one (pixels,)."""
     position = np.zeros((len(view.pixels), 3))
@@ -127,9 +133,12 @@ def pixel_albedo(
         points = points_under(caster, material, view.camera, pixels)
         # An image with albedo 1 holds diffuse + specular; its diffuse part is known, and zero says: no light arrives.
         model = photograph(caster, bright, view.camera, pixels, direction, intensity, offset)
-        diffuse = (points.normal @ direction.T).clip(0).astype(np.float32)[..., None] * intensity.astype(np.float32)
+        towards = view_directions(view.camera, points.position)
+        diffuse = diffuse_shading(points.normal, towards, direction, material.grazing)[..., None] * intensity.astype(np.float32)
         usable: Bool = (model[..., 0] > 0) & (diffuse[..., 0] > 0) & _usable(view, part)
         measured = view.samples[part].astype(np.float32) * np.float32(view.scale) - (model - diffuse)
+        if arriving is not None:
+            diffuse += arriving.at(points.position, points.mesh_normal) * intensity.astype(np.float32)
         position[part] = points.position
         albedo[part] = _robust_albedo(measured, diffuse, usable)
         known[part] = points.hit & usable.any(1)
@@ -180,12 +189,14 @@ def _photographed_albedo(
     surface: Surface, material: Material, lights: Lights, capture: Capture, position: Float, normal: Float
 ) -> tuple[Float, Bool]:
     """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
-    caster = RayCaster(surface)
+    caster, sources = RayCaster(surface), light_sources(surface, material)
     offset = mean_edge_length(surface)
     total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
 
     def solved(i: int) -> tuple[Float, NDArray[np.float32], Bool]:
-        hit, albedo, known = pixel_albedo(caster, material, capture.views[i], lights.direction[i], lights.intensity[i], offset)
+        direction, intensity = lights.direction[i], lights.intensity[i]
+        arriving = light_arriving(sources, material, direction)
+        hit, albedo, known = pixel_albedo(caster, material, capture.views[i], direction, intensity, offset, arriving)
         return hit, albedo, known & _away_from_border(capture.views[i])
 
     for view, (hit, albedo, known) in zip(capture.views, _on_all_cores(solved, len(capture.views)), strict=True):

@@ -17,7 +17,7 @@ from mvps.joint.refine import grey_lights
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.vertices import Agreement, agreement, fuse, rotations
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
-from mvps.scene import Material, Surface
+from mvps.scene import Law, Material, Surface
 
 CPU = torch.device("cpu")
 
@@ -37,27 +37,36 @@ SITUATIONS = {
 
 @pytest.mark.parametrize("situation", SITUATIONS)
 def test_derivatives_against_finite_differences(situation: str) -> None:
-    normal, light, sharpness = (torch.tensor(v, dtype=torch.float64) for v in SITUATIONS[situation])
+    *directions, sharpness = SITUATIONS[situation]
+    normal, light = (torch.tensor(v, dtype=torch.float64) for v in directions)
     normal, light = (torch.nn.functional.normalize(v, dim=0)[None] for v in (normal, light))
     view = torch.nn.functional.normalize(torch.tensor([[0.05, 0.1, 1.0]], dtype=torch.float64), dim=1)
     reflectance = torch.tensor([[0.4, 0.3]], dtype=torch.float64)
-    intensity, sharp = torch.tensor([1.3], dtype=torch.float64), sharpness[None]
+    intensity, gathered = torch.tensor([1.3], dtype=torch.float64), torch.tensor([[0.2]], dtype=torch.float64)
+    law = Law((sharpness,), -0.3, 0.7)
     frame = tangents(normal)
 
     def image(turn: torch.Tensor, values: torch.Tensor, m: torch.Tensor) -> torch.Tensor:
         turned = torch.nn.functional.normalize(normal + turn[:1] * frame[0] + turn[1:] * frame[1], dim=1)
         length = m.norm(dim=1)
-        return evaluate(turned, values, view, DirectionalLights(m / length[:, None], length), sharp).predicted[0, 0]
+        return evaluate(turned, values, view, DirectionalLights(m / length[:, None], length), law, gathered).predicted[0, 0]
 
     lights = DirectionalLights(light, intensity)
-    shaded = evaluate(normal, reflectance, view, lights, sharp)
+    shaded = evaluate(normal, reflectance, view, lights, law, gathered)
     by_vertex = vertex_jacobian(shaded, frame, view, lights)[0, :, 0]
-    by_light = light_jacobian(shaded, normal, view, lights, torch.eye(3, dtype=torch.float64))[0, 0]
+    by_light = light_jacobian(shaded, normal, view, lights, law, torch.eye(3, dtype=torch.float64))[0, 0]
     zero = torch.zeros(2, dtype=torch.float64)
     numeric = torch.autograd.functional.jacobian(image, (zero, reflectance, light * intensity))
     assert torch.allclose(by_vertex, torch.cat([numeric[0], numeric[1][0]]), atol=1e-10)
     assert torch.allclose(by_light, numeric[2][0], atol=1e-10)
     step = 1e-6
+    by_law = (shaded.grazing, shaded.indirect)
+    for name, derivative in zip(("grazing", "bounce"), by_law, strict=True):
+        after, before = (
+            evaluate(normal, reflectance, view, lights, replace(law, **{name: getattr(law, name) + s}), gathered).predicted
+            for s in (step, -step)
+        )
+        assert abs((after - before) / (2 * step) - derivative) < 1e-8
     for k in range(2):
         turn = torch.zeros(2, dtype=torch.float64)
         turn[k] = step
@@ -79,23 +88,23 @@ def scene() -> SphereScene:
 
 
 def problem(scene: SphereScene) -> tuple:
-    """Samples, true vertices, true lights and sharpness of the sphere."""
+    """Samples, true vertices, true lights and law of the sphere."""
     reconstruction = scene.reconstruction
     views = observe(scene.capture, reconstruction.surface, reconstruction.lights, CPU)
     material = reconstruction.material
     values = np.column_stack([material.albedo.mean(1), material.specular_weight])
     normal, reflectance = (torch.tensor(a, dtype=torch.float32) for a in (material.normal, values))
     vertices = Vertices(normal, reflectance, torch.full((len(values),), 0.01))
-    return views, vertices, grey_lights(reconstruction.lights, CPU), torch.tensor(material.sharpness, dtype=torch.float32)
+    return views, vertices, grey_lights(reconstruction.lights, CPU), material.law
 
 
 def test_vertices_find_normals_and_reflectance_from_the_meshs_normals(scene: SphereScene) -> None:
-    views, truth, lights, sharpness = problem(scene)
+    views, truth, lights, law = problem(scene)
     mesh_normal = torch.tensor(vertex_normals(scene.reconstruction.surface), dtype=torch.float32)
     state = Vertices(mesh_normal, torch.tensor([[0.4, 0.0, 0.0]]).repeat(len(mesh_normal), 1), torch.full((len(mesh_normal),), 0.4))
     anchor = free_reflectance(mesh_normal, 0.3, 3)
     for _ in range(12):
-        state = vertex_step(views, state, lights, sharpness, anchor)
+        state = vertex_step(views, state, lights, law, anchor)
     before = degrees(mesh_normal.numpy(), truth.normal.numpy())
     after = degrees(state.normal.numpy(), truth.normal.numpy())
     assert np.median(after) < 0.5 < 0.2 * np.median(before) + 0.5 and np.median(after) < 0.2 * np.median(before)
@@ -105,8 +114,8 @@ def test_vertices_find_normals_and_reflectance_from_the_meshs_normals(scene: Sph
 
 
 def test_normal_equations_do_not_depend_on_which_thread_was_faster(scene: SphereScene) -> None:
-    views, truth, lights, sharpness = problem(scene)
-    first, second = (vertex_equations(views, truth, lights, sharpness).hessian for _ in range(2))
+    views, truth, lights, law = problem(scene)
+    first, second = (vertex_equations(views, truth, lights, law).hessian for _ in range(2))
     assert torch.equal(first, second)
 
 
@@ -128,7 +137,7 @@ def light_error(lights: list[DirectionalLights], truth: list[DirectionalLights])
 @pytest.mark.parametrize("one_rig", [True, False])
 @pytest.mark.parametrize("start", [0.0, 5.0])
 def test_lights_stay_at_the_truth_and_come_back_to_it(scene: SphereScene, start: float, one_rig: bool) -> None:
-    views, vertices, truth, sharpness = problem(scene)
+    views, vertices, truth, law = problem(scene)
     rotations_ = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
     lights = turned(truth, start)
     if one_rig:
@@ -139,22 +148,22 @@ def test_lights_stay_at_the_truth_and_come_back_to_it(scene: SphereScene, start:
     # The anchor is the smooth sphere: true on average, some degrees off at every vertex.
     anchor = free_reflectance(torch.tensor(vertex_normals(scene.reconstruction.surface), dtype=torch.float32), 0.05, 3)
     for _ in range(8):
-        lights = light_step(views, vertices, lights, sharpness, anchor, rotations_, one_rig)
+        lights, law = light_step(views, vertices, lights, law, anchor, rotations_, one_rig)
         lights, vertices = with_mean_one(lights, vertices)
         for _ in range(2):
-            vertices = vertex_step(views, vertices, lights, sharpness, anchor)
+            vertices = vertex_step(views, vertices, lights, law, anchor)
     assert light_error(lights, truth) < 0.5
 
 
 def test_light_step_is_finite_with_a_single_light(scene: SphereScene) -> None:
-    views, vertices, truth, sharpness = problem(scene)
+    views, vertices, truth, law = problem(scene)
     few = [replace(s, image=s.image[:, :1], data=s.data[:, :1]) for s in views]
     lights = [DirectionalLights(of_view.direction[:1], of_view.intensity[:1]) for of_view in truth]
     rotations_ = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
     anchor = free_reflectance(vertices.normal, 0.05, 3)
-    stepped = light_step(few, vertices, lights, sharpness, anchor, rotations_, True)
+    stepped, _ = light_step(few, vertices, lights, law, anchor, rotations_, True)
     assert all(torch.isfinite(of_view.direction).all() and torch.isfinite(of_view.intensity).all() for of_view in stepped)
-    state = vertex_step(few, vertices, lights, sharpness, anchor)
+    state = vertex_step(few, vertices, lights, law, anchor)
     assert torch.isfinite(state.normal).all() and torch.isfinite(state.reflectance).all() and (state.reflectance >= 0).all()
 
 

@@ -2,6 +2,7 @@
 
 import torch
 
+from mvps.scene import Law
 from mvps.shading import half_dot_normal, lobes, shade
 
 N = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -11,11 +12,9 @@ def unit(*values: float) -> torch.Tensor:
     return torch.nn.functional.normalize(torch.tensor([values], dtype=torch.float64), dim=1)
 
 
-def shaded(view: torch.Tensor, light: torch.Tensor, weight: float = 0.5, sharpness: float = 30.0) -> torch.Tensor:
+def shaded(view: torch.Tensor, light: torch.Tensor, weight: float = 0.5, sharpness: float = 30.0, grazing: float = 0.0) -> torch.Tensor:
     albedo = torch.tensor([[0.2, 0.3, 0.4]], dtype=torch.float64)
-    return shade(N, view, light, albedo, torch.tensor([[weight]], dtype=torch.float64), torch.tensor([sharpness], dtype=torch.float64))[
-        0, 0
-    ]
+    return shade(N, view, light, albedo, torch.tensor([[weight]], dtype=torch.float64), Law((sharpness,), grazing))[0, 0]
 
 
 def test_attached_shadow_is_black() -> None:
@@ -31,7 +30,15 @@ def test_lobe_peaks_at_its_weight_where_the_half_vector_is_the_normal() -> None:
 
 def test_reflectance_is_reciprocal() -> None:
     a, b = unit(0.3, 0.4, 1), unit(-0.7, 0.1, 0.6)
-    assert torch.allclose(shaded(a, b) / b[0, 2], shaded(b, a) / a[0, 2])
+    for grazing in (0.0, -0.4):
+        assert torch.allclose(shaded(a, b, grazing=grazing) / b[0, 2], shaded(b, a, grazing=grazing) / a[0, 2])
+
+
+def test_grazing_changes_the_diffuse_part_alone_and_only_at_grazing_angles() -> None:
+    facing, aslant = unit(0, 0, 1), unit(1, 0, 0.1)
+    assert torch.allclose(shaded(facing, facing, grazing=-0.4), shaded(facing, facing))
+    change = shaded(facing, aslant, grazing=-0.4) - shaded(facing, aslant)
+    assert torch.allclose(change, -0.4 * (1 - aslant[0, 2]) ** 3 * torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64) * aslant[0, 2])
 
 
 def test_opposite_view_and_light_stay_finite() -> None:
@@ -52,10 +59,9 @@ def test_gradients_against_finite_differences() -> None:
     normal, view, light = (torch.randn(2, 3, dtype=torch.float64, generator=generator) for _ in range(3))
     inputs = [normal + 3 * N, view + 3 * N, light + 3 * N, torch.rand(2, 3, dtype=torch.float64), torch.rand(2, 2, dtype=torch.float64)]
     inputs = [x.requires_grad_() for x in inputs]
-    sharpness = torch.tensor([3.0, 8.0], dtype=torch.float64)
 
     def image(n: torch.Tensor, v: torch.Tensor, light: torch.Tensor, a: torch.Tensor, w: torch.Tensor) -> torch.Tensor:
         n, v, light = (torch.nn.functional.normalize(x, dim=1) for x in (n, v, light))
-        return shade(n, v, light, a, w, sharpness)
+        return shade(n, v, light, a, w, Law((3.0, 8.0), -0.3))
 
     assert torch.autograd.gradcheck(image, inputs)

@@ -3,11 +3,14 @@
 For a vertex with normal n, grey albedo a and lobe weights w_k, seen along v under light m = e l (e intensity, l unit):
 
     c = |v + l| = sqrt(2 + 2 v.l),   h.n = (n.v + n.l) / c,   E_k = exp(s_k (h.n - 1)),   q = e max(n.l, 0)
-    I = q (a + sum_k w_k E_k)
+    I = q R + a b e G,     R = a D_l D_v + sum_k w_k E_k,     B = sum_k s_k w_k E_k
 
-    dI/dn = e [n.l > 0] (a + sum w E) l + q B (l + v) / c,             B = sum_k s_k w_k E_k
-    dI/da = q,   dI/dw_k = q E_k
-    dI/dm = [n.l > 0] (a + sum w E) n + max(n.l, 0) B (1 - l l^T) (n / c - (h.n) v / c^2)          (the half vector moves with the light)
+with D_x = 1 + g (1 - n.x)^p (shading.py) and b e G the light that other surfaces send (bounce.py)
+
+    dI/dn = e [n.l > 0] R l + q a (D_l' D_v l + D_l D_v' v) + q B (l + v) / c
+    dI/da = q D_l D_v + b e G,   dI/dw_k = q E_k
+    dI/dm = [n.l > 0] R n + max(n.l, 0) (1 - l l^T) (a D_l' D_v n + B (n / c - (h.n) v / c^2)) + a b G l   (the half vector moves with l)
+    dI/dg = q a ((1 - n.l)^p D_v + (1 - n.v)^p D_l),   dI/db = a e G
 
 Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale per vertex, the standard deviation of its weighted residuals.
 Every block is Gauss-Newton: normal equations are accumulated over chunks of pairs, never a Jacobian as a whole, and add up over views.
@@ -24,6 +27,7 @@ import torch
 from torch import Tensor
 
 from mvps.joint.observe import ViewSamples
+from mvps.scene import GRAZING_POWER, Law
 from mvps.shading import PARALLEL, half_dot_normal
 from solvers.low_rank import CAUCHY_95
 
@@ -71,8 +75,8 @@ class DirectionalLights:
 
 @dataclass(frozen=True)
 class Shaded:
-    """The image model on a chunk of pairs, (n, lights) each: lit 1 above the horizon; n . l; h . n; c; basis q and q E_k;
-    reflectance a + sum w E; slope B; predicted I."""
+    """The image model on a chunk of pairs, (n, lights) each: lit 1 above the horizon; n . l clamped at 0; h . n; c; basis dI/da and
+    q E_k; reflectance R; slope B; of_light a D_l' D_v, of_view a D_l D_v'; grazing dI/dg; indirect a e G; predicted I."""
 
     lit: Tensor
     n_dot_l: Tensor
@@ -81,46 +85,71 @@ class Shaded:
     basis: list[Tensor]
     reflectance: Tensor
     slope: Tensor
+    of_light: Tensor
+    of_view: Tensor
+    grazing: Tensor
+    indirect: Tensor
     predicted: Tensor
 
 
-def evaluate(normal: Tensor, reflectance: Tensor, towards: Tensor, lights: DirectionalLights, sharpness: Tensor) -> Shaded:
-    """The image model for normal, towards (n, 3) and reflectance (n, 1 + lobes) under all lights of a view."""
+def evaluate(
+    normal: Tensor, reflectance: Tensor, towards: Tensor, lights: DirectionalLights, law: Law, gathered: Tensor | None = None
+) -> Shaded:
+    """The image model for normal, towards (n, 3) and reflectance (n, 1 + lobes) under all lights of a view. gathered (n, lights): G."""
     light, intensity = lights.direction, lights.intensity
     n_dot_l = normal @ light.T
     v_dot_l = towards @ light.T
-    half = half_dot_normal((normal * towards).sum(-1, keepdim=True), n_dot_l, v_dot_l)
+    n_dot_v = (normal * towards).sum(-1, keepdim=True)
+    half = half_dot_normal(n_dot_v, n_dot_l, v_dot_l)
     c = (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
-    q = n_dot_l.clamp_min(0) * intensity
-    total = reflectance[:, :1].expand_as(q)
+    lit = (n_dot_l > 0).to(normal.dtype)
+    n_dot_l = n_dot_l.clamp_min(0)
+    q = n_dot_l * intensity
+    albedo = reflectance[:, :1]
+    (of_l, slope_l), (of_v, slope_v) = _grazing(n_dot_l), _grazing(n_dot_v.clamp_min(0))
+    D_l, D_v = 1 + law.grazing * of_l, 1 + law.grazing * of_v
+    total = albedo * D_l * D_v
+    grazing = q * (albedo * (of_l * D_v + of_v * D_l))
+    indirect = torch.zeros_like(q) if gathered is None else albedo * intensity * gathered
     slope = torch.zeros_like(q)
-    basis = [q]
-    for k, s in enumerate(sharpness.tolist()):
+    basis = [q * (D_l * D_v) + (0 if gathered is None else law.bounce * intensity * gathered)]
+    for k, s in enumerate(law.sharpness):
         lobe = torch.exp(s * (half - 1))
         weighted = lobe * reflectance[:, k + 1, None]
         total = total + weighted
         slope = slope + s * weighted
         basis.append(q * lobe)
-    return Shaded((n_dot_l > 0).to(q.dtype), n_dot_l, half, c, basis, total, slope, q * total)
+    predicted = q * total + law.bounce * indirect
+    of_light, of_view = albedo * law.grazing * slope_l * D_v, albedo * law.grazing * D_l * slope_v
+    return Shaded(lit, n_dot_l, half, c, basis, total, slope, of_light, of_view, grazing, indirect, predicted)
+
+
+def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
+    """(1 - cosine)^p and its derivative."""
+    missing = 1 - cosine
+    lower = missing ** (GRAZING_POWER - 1)
+    return lower * missing, -GRAZING_POWER * lower
 
 
 def vertex_jacobian(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> Tensor:
     """(n, 3 + lobes, lights) derivatives of the samples by two tangential steps of the normal, the albedo and the weights."""
     along_light = shaded.lit * lights.intensity * shaded.reflectance
-    along_half = shaded.basis[0] * shaded.slope / shaded.c
-    both = along_light + along_half
-    columns = [both * (t @ lights.direction.T) + along_half * (t * towards).sum(-1, keepdim=True) for t in frame]
+    q = shaded.n_dot_l * lights.intensity
+    along_half = q * shaded.slope / shaded.c
+    along_light = along_light + along_half + q * shaded.of_light
+    along_view = along_half + q * shaded.of_view
+    columns = [along_light * (t @ lights.direction.T) + along_view * (t * towards).sum(-1, keepdim=True) for t in frame]
     return torch.stack(columns + shaded.basis, 1)
 
 
-def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: DirectionalLights, rotation: Tensor) -> Tensor:
+def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: DirectionalLights, law: Law, rotation: Tensor) -> Tensor:
     """(n, lights, 3) derivatives of the samples by m = intensity * direction in the camera's frame (rotation: camera_from_world)."""
-    along_half = shaded.n_dot_l.clamp_min(0) * shaded.slope / shaded.c
+    along_normal = shaded.n_dot_l * (shaded.slope / shaded.c + shaded.of_light)
     # dI/dm = alpha n + beta v + gamma l
-    alpha = shaded.lit * shaded.reflectance + along_half
-    beta = -along_half * shaded.half / shaded.c
+    alpha = shaded.lit * shaded.reflectance + along_normal
+    beta = -shaded.n_dot_l * shaded.slope / shaded.c * shaded.half / shaded.c
     v_dot_l = shaded.c**2 / 2 - 1
-    gamma = -(along_half * shaded.n_dot_l + beta * v_dot_l)
+    gamma = law.bounce * shaded.indirect / lights.intensity - (along_normal * shaded.n_dot_l + beta * v_dot_l)
     return (
         alpha[..., None] * (normal @ rotation.T)[:, None]
         + beta[..., None] * (towards @ rotation.T)[:, None]
@@ -133,7 +162,7 @@ def robust(residual: Tensor, scale: Tensor) -> Tensor:
     return 1 / (1 + (residual / (CAUCHY_95 * scale[:, None])) ** 2)
 
 
-def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor) -> NormalEquations:
+def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
     n, p = len(vertices.normal), 2 + vertices.reflectance.shape[1]
     like = vertices.normal
     hessian, gradient = like.new_zeros(n, p, p), like.new_zeros(n, p)
@@ -142,7 +171,7 @@ def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list
     for samples, of_view in zip(views, lights, strict=True):
         for part in samples.chunks():
             index, towards = samples.vertex[part], samples.towards[part]
-            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, sharpness)
+            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
             residual = shaded.predicted - samples.image[part]
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
             jacobian = vertex_jacobian(shaded, (first[index], second[index]), towards, of_view)
@@ -154,7 +183,7 @@ def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list
     return NormalEquations(hessian, gradient, squares, count)
 
 
-def vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor) -> NormalEquations:
+def vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
     """Normal equations of every vertex at the current state, unknowns as in `vertex_jacobian`.
 
     The views are dealt out to the cores in a fixed order and their sums added in that order, so that the result does not
@@ -162,7 +191,7 @@ def vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[
     """
     hands = min(WORKERS, len(views))
     with ThreadPoolExecutor(hands) as pool:
-        parts = list(pool.map(lambda k: _vertex_equations(views[k::hands], vertices, lights[k::hands], sharpness), range(hands)))
+        parts = list(pool.map(lambda k: _vertex_equations(views[k::hands], vertices, lights[k::hands], law), range(hands)))
     total = parts[0]
     for part in parts[1:]:
         total = NormalEquations(

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
-from mvps.joint.observe import ViewSamples, channel_ratio, observe
+from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.reflectance import colours
-from mvps.scene import Capture, Float, Lights, Material, Surface
+from mvps.scene import Capture, Float, Law, Lights, Material, Surface
 
 STEPS = 6
 
@@ -46,7 +46,7 @@ def _step(
     views: list[ViewSamples],
     vertices: Vertices,
     lights: list[DirectionalLights],
-    sharpness: torch.Tensor,
+    law: Law,
     rotations: list[torch.Tensor],
     one_rig: bool,
 ) -> list[DirectionalLights]:
@@ -56,10 +56,10 @@ def _step(
         H, g = torch.zeros(count, 3, 3), torch.zeros(count, 3)
         for part in samples.chunks():
             index, towards = samples.vertex[part], samples.towards[part]
-            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, sharpness)
+            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
             residual = shaded.predicted - samples.image[part]
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
-            J = light_jacobian(shaded, vertices.normal[index], towards, of_view, rotation)
+            J = light_jacobian(shaded, vertices.normal[index], towards, of_view, law, rotation)
             H += torch.einsum("pl,pli,plj->lij", weight, J, J)
             g += torch.einsum("pl,pli,pl->li", weight, J, residual)
         sums.append((H, g))
@@ -88,7 +88,6 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     """Lights of all photographs of `capture` for a known surface and material. one_rig: its views share them."""
     torch.set_num_threads(1)
     rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in capture.views]
-    sharpness = torch.tensor(material.sharpness, dtype=torch.float32)
     # With the light at the camera no visible vertex is in shadow.
     from_camera = [np.tile(-view.camera.rotation[2], (len(view.lights), 1)) for view in capture.views]
     white = [np.ones_like(d) for d in from_camera]
@@ -99,8 +98,10 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     for _ in range(2):
         lights = _as_lights(grey, [channel_ratio(e) for e in white], one_rig)
         views = observe(capture, surface, lights, torch.device("cpu"))
+        if material.bounce:
+            views = with_gathered(views, surface, material.albedo.mean(1), material.bounce, lights)
         for _ in range(STEPS):
-            grey = _step(views, vertices, grey, sharpness, rotations, one_rig)
+            grey = _step(views, vertices, grey, material.law, rotations, one_rig)
     ratios = [channel_ratio(e) for e in white]
-    _, ratios = colours(capture, surface, views, vertices, grey, sharpness, ratios, one_rig)
+    _, ratios = colours(capture, surface, views, vertices, grey, material.law, ratios, one_rig)
     return _as_lights(grey, ratios, one_rig)

@@ -25,8 +25,15 @@ from torch import Tensor
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_jacobian
 from mvps.joint.observe import ViewSamples
 from mvps.joint.steps import LARGEST_TURN, Anchor
+from mvps.scene import Law
 
 VERTICES_PER_BLOCK = 256
+
+OF_LAW = 2
+"""Unknowns of the law: grazing and bounce."""
+
+LARGEST_GRAZING = 0.9
+"""Of the diffuse term's relative change at 90 degrees: none absorbs all there, none doubles."""
 
 FAR_OFF = 0.05
 """Radians between mesh and refined normal beyond which the mesh's normal is an outlier rather than noise."""
@@ -39,7 +46,8 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
     few = []
     for s in views:
         rows = torch.nonzero(place[s.vertex] >= 0)[:, 0]
-        few.append(ViewSamples(place[s.vertex[rows]], s.towards[rows], s.weight[rows], s.image[rows], s.data[rows]))
+        gathered = None if s.gathered is None else s.gathered[rows]
+        few.append(ViewSamples(place[s.vertex[rows]], s.towards[rows], s.weight[rows], s.image[rows], s.data[rows], gathered))
     state = Vertices(vertices.normal[chosen], vertices.reflectance[chosen], vertices.scale[chosen])
     tie = Anchor(anchor.normal[chosen], anchor.sigma, anchor.reflectance[chosen], anchor.reflectance_sigma[chosen])
     return few, state, tie
@@ -65,18 +73,20 @@ def _coupled(
     views: list[ViewSamples],
     vertices: Vertices,
     lights: list[DirectionalLights],
-    sharpness: Tensor,
+    law: Law,
     rotations: list[Tensor],
     layout: _Layout,
 ) -> tuple[Tensor, ...]:
-    """H_mm, g_m, H_jj, g_j, H_jm, each sample divided by its vertex's residual variance, and the weight of a vertex's samples (V,)."""
+    """H_mm, g_m, H_jj, g_j, H_jm, each sample divided by its vertex's residual variance, and the weight of a vertex's samples (V,).
+
+    The last two of m are the law's grazing and bounce.
+    """
     n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
-    lights_hessian, lights_gradient = (
-        like.new_zeros(layout.total, layout.total, dtype=torch.float64),
-        like.new_zeros(layout.total, dtype=torch.float64),
-    )
+    unknowns = layout.total + OF_LAW
+    lights_hessian = like.new_zeros(unknowns, unknowns, dtype=torch.float64)
+    lights_gradient = like.new_zeros(unknowns, dtype=torch.float64)
     hessian, gradient = like.new_zeros(n, p, p), like.new_zeros(n, p)
-    cross, samples_of = like.new_zeros(n, p, layout.total), like.new_zeros(n)
+    cross, samples_of = like.new_zeros(n, p, unknowns), like.new_zeros(n)
     frame = tangents(vertices.normal)
     for samples, of_view, rotation, start in zip(views, lights, rotations, layout.start, strict=True):
         width = 3 * len(of_view.intensity)
@@ -84,25 +94,32 @@ def _coupled(
         for part in samples.chunks():
             index, towards = samples.vertex[part], samples.towards[part]
             normal = vertices.normal[index]
-            shaded = evaluate(normal, vertices.reflectance[index], towards, of_view, sharpness)
+            shaded = evaluate(normal, vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
             residual = shaded.predicted - samples.image[part]
             scale = vertices.scale[index]
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, scale) / scale[:, None] ** 2
             of_vertex = vertex_jacobian(shaded, (frame[0][index], frame[1][index]), towards, of_view)
-            of_light = light_jacobian(shaded, normal, towards, of_view, rotation)
+            of_light = light_jacobian(shaded, normal, towards, of_view, law, rotation)
+            of_law = torch.stack([shaded.grazing, shaded.indirect], -1)
             weighted = of_vertex * weight[:, None]
             hessian.index_add_(0, index, weighted @ of_vertex.transpose(1, 2))
             gradient.index_add_(0, index, (weighted @ residual[..., None])[..., 0])
             samples_of.index_add_(0, index, (weight * scale[:, None] ** 2).sum(1))
             coupling = (weighted[..., None] * of_light[:, None]).reshape(len(index), p, width)
             cross[:, :, start : start + width].index_add_(0, index, coupling)
+            cross[:, :, layout.total :].index_add_(0, index, weighted @ of_law)
             heavy = of_light * weight[..., None]
             blocks += torch.block_diag(*torch.einsum("pli,plj->lij", heavy, of_light).double())
             lights_gradient[start : start + width] += torch.einsum("pli,pl->li", heavy, residual).reshape(-1).double()
+            shared = torch.einsum("pli,plk->lik", heavy, of_law).reshape(width, OF_LAW).double()
+            lights_hessian[start : start + width, layout.total :] += shared
+            lights_hessian[layout.total :, start : start + width] += shared.T
+            lights_hessian[layout.total :, layout.total :] += torch.einsum("pl,pli,plj->ij", weight, of_law, of_law).double()
+            lights_gradient[layout.total :] += torch.einsum("pl,pli,pl->i", weight, of_law, residual).double()
     return lights_hessian, lights_gradient, hessian, gradient, cross, samples_of
 
 
-def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor) -> Tensor:
+def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, free_lights: bool) -> Tensor:
     """dm of the Schur complement."""
     H, g, hessian, gradient, cross, samples_of = parts
     away = vertices.normal - anchor.normal
@@ -126,7 +143,9 @@ def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor)
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
     diagonal = torch.diagonal(H).clamp_min(0)
     H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max())
-    step: Tensor = -torch.linalg.solve(H, g)
+    first = 0 if free_lights else len(g) - OF_LAW
+    step = torch.zeros_like(g)
+    step[first:] = -torch.linalg.solve(H[first:, first:], g[first:])
     return step
 
 
@@ -134,14 +153,19 @@ def light_step(
     views: list[ViewSamples],
     vertices: Vertices,
     lights: list[DirectionalLights],
-    sharpness: Tensor,
+    law: Law,
     anchor: Anchor,
     rotations: list[Tensor],
     one_rig: bool,
-) -> list[DirectionalLights]:
-    """One Gauss-Newton step of all lights with the vertices eliminated. rotations: camera_from_world of the views, float32."""
+    free_lights: bool = True,
+) -> tuple[list[DirectionalLights], Law]:
+    """One Gauss-Newton step of all lights (unless not free_lights), grazing and bounce with the vertices eliminated.
+
+    rotations: camera_from_world of the views, float32.
+    """
     layout = _layout(lights, one_rig)
-    step = _reduced_step(_coupled(views, vertices, lights, sharpness, rotations, layout), vertices, anchor)
+    parts = _coupled(views, vertices, lights, law, rotations, layout)
+    step = _reduced_step(parts, vertices, anchor, free_lights)
     stepped = []
     for of_view, rotation, start in zip(lights, rotations, layout.start, strict=True):
         m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T
@@ -151,7 +175,13 @@ def light_step(
         m = m + d
         intensity = m.norm(dim=1)
         stepped.append(DirectionalLights((m / intensity[:, None] @ rotation.double()).float(), intensity.float()))
-    return stepped
+    return stepped, _stepped_law(law, step[layout.total :], float(vertices.reflectance[:, 0].median()))
+
+
+def _stepped_law(law: Law, step: Tensor, albedo: float) -> Law:
+    """The law after a step, within LARGEST_GRAZING and so that a point of median albedo reflects no more than it receives."""
+    grazing, bounce = (float(value) for value in torch.tensor([law.grazing, law.bounce], dtype=step.dtype) + step.cpu())
+    return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=min(max(bounce, 0.0), 1 / max(albedo, 1e-300)))
 
 
 def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:

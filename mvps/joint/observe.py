@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvps.bounce import coarse_sources, gathered, interpolation
 from mvps.camera import bilinear, project, view_directions
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Capture, Float, Int, Lights, Surface, View
@@ -41,7 +42,8 @@ class ViewSamples:
     """One view's samples of the n vertices it sees. All in torch; directions in the world frame.
 
     vertex (n,) index; towards (n, 3) unit vector to the camera; weight (n,) of the pair; image (n, lights) grey radiance;
-    data (n, lights) bool, False where saturated or in cast shadow.
+    data (n, lights) bool, False where saturated or in cast shadow; gathered (n, lights) what other surfaces send (bounce.py), None
+    where that is not asked for.
     """
 
     vertex: Tensor
@@ -49,6 +51,11 @@ class ViewSamples:
     weight: Tensor
     image: Tensor
     data: Tensor
+    gathered: Tensor | None = None
+
+    def gathered_of(self, part: slice) -> Tensor | None:
+        """`gathered` of some pairs."""
+        return None if self.gathered is None else self.gathered[part]
 
     def chunks(self) -> Iterator[slice]:
         """Slices of the pairs that hold about SAMPLES_PER_CHUNK samples."""
@@ -121,3 +128,16 @@ def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.de
 
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         return list(pool.map(one, range(len(capture.views))))
+
+
+def with_gathered(views: list[ViewSamples], surface: Surface, albedo: Float, bounce: float, lights: Lights) -> list[ViewSamples]:
+    """The samples with what other surfaces send to them, for albedo (V,), the law's bounce and the lights."""
+    sources = coarse_sources(surface, albedo)
+    weight = interpolation(sources.of, surface.vertices, vertex_normals(surface))
+
+    def one(i: int) -> ViewSamples:
+        values = weight[views[i].vertex.cpu().numpy()] @ gathered(sources, lights.direction[i], bounce)
+        return replace(views[i], gathered=torch.from_numpy(values).to(views[i].image.device))
+
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+        return list(pool.map(one, range(len(views))))

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from mvps.bounce import Sources, at, coarse_sources, gathered
 from mvps.camera import view_directions
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio
@@ -22,8 +25,9 @@ from mvps.rendering import Points, points_under, shadow_at
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
 from mvps.visibility import RayCaster
 
-NORMAL_TIE = 0.1
-"""Standard deviation, radians, of a pixel's normal from the interpolated one: twice that of a vertex's normal, as detail adds to it."""
+NORMAL_TIE = 0.3
+"""Standard deviation, radians, of a pixel's normal from the interpolated one: it only speaks where samples do not, for the agreement of
+views must find the mesh's errors and not what the mesh says of itself."""
 
 ALBEDO_TIE, WEIGHT_TIE = 0.3, 0.05
 """Standard deviation of a pixel's albedo over the vertices' albedo, and of a lobe's weight over albedo plus weight. Albedo has edges that a
@@ -40,37 +44,55 @@ def _samples(view: View, points: Points, shadow: Bool, intensity: Float, hit: In
     return ViewSamples(torch.arange(n), torch.from_numpy(towards), torch.ones(n), torch.from_numpy(image), torch.from_numpy(data))
 
 
-def pixel_normals(view: View, caster: RayCaster, material: Material, direction: Float, intensity: Float, offset: float) -> NormalMap:
-    """Normals, grey albedo (in all channels) and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
+def _chroma(view: View, intensity: Float, hit: Int) -> NDArray[np.float32]:
+    """(n, 3) share of the channels in a pixel's radiance under white light, mean 1."""
+    white = (view.samples[hit] * (1 / channel_ratio(intensity)).astype(np.float32)).sum(1)
+    chroma: NDArray[np.float32] = white / np.maximum(white.mean(1, keepdims=True), 1e-12)
+    return chroma
 
-    direction, intensity (lights, 3); offset as in visibility.py.
+
+def pixel_normals(
+    view: View,
+    caster: RayCaster,
+    sources: Sources | None,
+    material: Material,
+    direction: Float,
+    intensity: Float,
+    offset: float,
+) -> NormalMap:
+    """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
+
+    sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3); offset as
+    in visibility.py.
     """
     points = points_under(caster, material, view.camera, view.pixels)
     hit = np.flatnonzero(points.hit)
     samples = _samples(view, points, shadow_at(caster, points, direction, offset), intensity, hit)
+    if sources is not None:
+        G = at(sources, gathered(sources, direction, material.bounce), points.position[hit], points.mesh_normal[hit])
+        samples = replace(samples, gathered=torch.from_numpy(G))
     known = np.column_stack([points.albedo.mean(1), points.specular_weight])[hit]
-    reflectance, normal, light, sharpness = (
-        torch.tensor(a, dtype=torch.float32) for a in (known, points.normal[hit], direction, material.sharpness)
-    )
+    reflectance, normal, light = (torch.tensor(a, dtype=torch.float32) for a in (known, points.normal[hit], direction))
     spread = torch.cat([ALBEDO_TIE * reflectance[:, :1], WEIGHT_TIE * (reflectance[:, :1] + reflectance[:, 1:])], 1)
     anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
     lights = [DirectionalLights(light, torch.tensor(intensity.mean(1), dtype=torch.float32))]
     state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
     for _ in range(STEPS):
-        state = vertex_step([samples], state, lights, sharpness, anchor)
+        state = vertex_step([samples], state, lights, material.law, anchor)
     towards = -view.camera.rotation[2].astype(np.float32)
     pixels = len(points.hit)
     normals = np.tile(towards, (pixels, 1))
     albedo, certain = np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
     normals[hit] = normalise(state.normal.double().numpy())
-    albedo[hit] = state.reflectance[:, :1].numpy()
-    certain[hit] = confidence([samples], state, lights, sharpness).numpy()
+    albedo[hit] = state.reflectance[:, :1].numpy() * _chroma(view, intensity, hit)
+    certain[hit] = confidence([samples], state, lights, material.law).numpy()
     return NormalMap(normals, albedo, certain)
 
 
 def all_pixel_normals(capture: Capture, surface: Surface, material: Material, lights: Lights) -> tuple[NormalMap, ...]:
     """`pixel_normals` of every view, on all cores."""
     caster, offset = RayCaster(surface), mean_edge_length(surface)
+    sources = coarse_sources(surface, material.albedo.mean(1)) if material.bounce else None
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         tasks = zip(capture.views, lights.direction, lights.intensity, strict=True)
-        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, material, task[1], task[2], offset), tasks))
+        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, task[1], task[2], offset), tasks))

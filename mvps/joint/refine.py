@@ -1,9 +1,7 @@
 """Stage II: lights, normals, reflectance and vertices, in rounds on an ever finer mesh.
 
 A round:  remesh -> samples (visibility and shadows traced anew) -> vertices for fixed lights -> lights with the vertices eliminated
--> vertices -> photometric stereo of the views under the new lights, if those moved -> agreement of views -> fused positions.
-At last the normals of every view's own pixels (pixels.py). The agreement of views must not use those: they are tied to the mesh whose
-error it is to find.
+-> vertices -> normals of every view's own pixels (pixels.py) -> agreement of views -> fused positions.
 """
 
 from __future__ import annotations
@@ -20,14 +18,13 @@ from scipy.spatial import cKDTree
 from mvps.camera import bilinear, pixel_footprint, project
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.lights import light_step, subset, with_mean_one
-from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in
+from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in, with_gathered
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import colours
 from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step, with_population
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
-from mvps.scene import Capture, CaptureError, Float, Lights, Material, NormalMap, Surface
-from solvers.low_rank import MAD_TO_SIGMA
+from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
 SHARPNESS = (8.0, 32.0, 128.0)
 """Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
@@ -44,8 +41,9 @@ LIGHT_STEPS = 3
 WEAK_TIE = 0.3
 """Standard deviation, radians, of refined normals from the mesh's in the vertices' own steps: it only speaks where samples do not."""
 
-LIGHTS_MOVED = 0.01
-"""Change of the lights, radians or relative intensity, from which the views' photometric stereo is done again."""
+LIGHT_TIE = 0.01
+"""The same while the lights are solved. What all vertices' normals have in common is known from the mesh far better than from images, whose
+model is wrong alike for all of them; noise of single vertices averages out."""
 
 STILL_DEG = 0.25
 """Mean change of normals in the last Gauss-Newton step, and of lights in the last round, below which they have settled: Gauss-Newton at
@@ -53,8 +51,6 @@ least halves its steps near a minimum, so that all further steps together are no
 
 POOR_FIT = 0.1
 """Relative residual above which the model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy objects."""
-
-PhotometricStereo = Callable[[Lights], tuple[NormalMap, ...]]
 
 
 @dataclass(frozen=True)
@@ -85,6 +81,7 @@ class Refined:
     material: Material
     lights: Lights
     maps: tuple[NormalMap, ...]
+    law: Law
     rounds: list[dict[str, float]]
     status: str
     text: str
@@ -97,7 +94,7 @@ class _State:
     surface: Surface
     lights: Lights
     maps: tuple[NormalMap, ...]
-    maps_lights: Lights
+    law: Law
     vertices: Vertices | None = None
     views: list[ViewSamples] = field(default_factory=list)
 
@@ -173,14 +170,13 @@ def _solve_lights(
     candidates = torch.nonzero(seen)[:, 0].cpu().numpy()
     chosen = np.sort(generator.permutation(candidates)[: settings.light_vertices])
     few, part, tie = subset(state.views, vertices, anchor, torch.from_numpy(chosen).to(device))
-    sharpness = _tensor(SHARPNESS, device)
     rotations = [_tensor(view.camera.rotation, device) for view in capture.views]
     lights = grey_lights(state.lights, device)
     for _ in range(LIGHT_STEPS):
-        lights = light_step(few, part, lights, sharpness, tie, rotations, state.lights.one_rig)
+        lights, state.law = light_step(few, part, lights, state.law, tie, rotations, state.lights.one_rig, settings.free_lights)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
-            part = vertex_step(few, part, lights, sharpness, tie)
+            part = vertex_step(few, part, lights, state.law, tie)
     return coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
 
 
@@ -200,7 +196,6 @@ def _photometric_round(
     state: _State,
     capture: Capture,
     settings: RefineSettings,
-    photometric_stereo: PhotometricStereo,
     carried: tuple[Surface, Vertices] | None,
     generator: np.random.Generator,
     device: torch.device,
@@ -209,28 +204,24 @@ def _photometric_round(
     state.views = observe(capture, state.surface, state.lights, device)
     mesh_normal = vertex_normals(state.surface)
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(SHARPNESS))
-    sharpness = _tensor(SHARPNESS, device)
     vertices = _started(state, capture, mesh_normal, carried, device)
     before = vertices.normal
     lights = grey_lights(state.lights, device)
     for _ in range(MATERIAL_STEPS):
-        vertices = vertex_step(state.views, vertices, lights, sharpness, free)
-    free = with_population(state.views, vertices, lights, sharpness, free)
-    moved = (0.0, 0.0)
-    if settings.free_lights:
-        deviation = np.median(np.linalg.norm(vertices.normal.cpu().numpy() - mesh_normal, axis=1))
-        tie = replace(free, sigma=float(np.clip(MAD_TO_SIGMA * deviation, NORMAL_SIGMA / 5, NORMAL_SIGMA)))
-        solved = _solve_lights(state, vertices, tie, capture, settings, generator, device)
-        moved = light_change(state.lights, solved)
-        state.lights = solved
-        lights = grey_lights(solved, device)
+        vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    albedo = vertices.reflectance[:, 0].double().cpu().numpy()
+    state.views = with_gathered(state.views, state.surface, albedo, state.law.bounce, state.lights)
+    free = with_population(state.views, vertices, lights, state.law, free)
+    solved = _solve_lights(state, vertices, replace(free, sigma=LIGHT_TIE), capture, settings, generator, device)
+    moved = light_change(state.lights, solved)
+    state.lights = solved
+    lights = grey_lights(solved, device)
     for _ in range(2):
         last = vertices.normal
-        vertices = vertex_step(state.views, vertices, lights, sharpness, free)
+        vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
-    turn_of_lights, brighter = light_change(state.maps_lights, state.lights)
-    if max(np.radians(turn_of_lights), brighter) > LIGHTS_MOVED:
-        state.maps, state.maps_lights = photometric_stereo(state.lights), state.lights
+    grey = vertices.reflectance[:, :1].double().cpu().numpy().repeat(3, axis=1)
+    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey, lights), state.lights)
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (_angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     return {
@@ -239,6 +230,8 @@ def _photometric_round(
         "intensity_change": moved[1],
         "normal_change_deg": float(np.mean(turned)),
         "last_step_deg": float(np.mean(settling)),
+        "grazing": state.law.grazing,
+        "bounce": state.law.bounce,
     }
 
 
@@ -269,7 +262,7 @@ def refine(
     surface: Surface,
     lights: Lights,
     maps: tuple[NormalMap, ...],
-    photometric_stereo: PhotometricStereo,
+    law: Law,
     settings: RefineSettings,
     seed: int,
     device: str,
@@ -277,20 +270,20 @@ def refine(
 ) -> Refined:
     """Stage II from a rough surface, lights and the views' photometric stereo under these lights.
 
-    photometric_stereo does the latter again for other lights; on_round(number from 1, what changed) is called after each round.
+    on_round(number from 1, what changed) is called after each round.
     """
     generator = np.random.default_rng(seed)
     on = torch.device(device)
     torch.set_num_threads(1)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
-    state = _State(surface, lights, maps, lights)
+    state = _State(surface, lights, maps, law)
     carried: tuple[Surface, Vertices] | None = None
     account: list[dict[str, float]] = []
     for number, round_settings in enumerate(settings.rounds, start=1):
         state.surface = isotropic_remesh(state.surface, round_settings.edge * pixel)
         mesh_normal = vertex_normals(state.surface)
         if round_settings.photometric:
-            changes = _photometric_round(state, capture, settings, photometric_stereo, carried, generator, on)
+            changes = _photometric_round(state, capture, settings, carried, generator, on)
             assert state.vertices is not None
             normal = normalise(state.vertices.normal.double().cpu().numpy())
             seen = [s.vertex.cpu().numpy() for s in state.views]
@@ -312,18 +305,16 @@ def refine(
 
 def _finished(state: _State, capture: Capture, account: list[dict[str, float]], device: torch.device) -> Refined:
     assert state.vertices is not None
-    sharpness = _tensor(SHARPNESS, device)
     ratios = [channel_ratio(e) for e in state.lights.intensity]
     grey = grey_lights(state.lights, device)
-    albedo, ratios = colours(capture, state.surface, state.views, state.vertices, grey, sharpness, ratios, state.lights.one_rig)
+    albedo, ratios = colours(capture, state.surface, state.views, state.vertices, grey, state.law, ratios, state.lights.one_rig)
     lights = coloured_lights(grey, ratios, state.lights.one_rig)
-    material = _material(state, albedo, grey, sharpness)
+    material = _material(state, albedo, grey)
     status, text = _verdict(account)
-    maps = all_pixel_normals(capture, state.surface, material, lights)
-    return Refined(state.surface, material, lights, maps, account, status, text)
+    return Refined(state.surface, material, lights, state.maps, state.law, account, status, text)
 
 
-def _material(state: _State, albedo: Float, lights: list[DirectionalLights], sharpness: torch.Tensor) -> Material:
+def _material(state: _State, albedo: Float, lights: list[DirectionalLights]) -> Material:
     """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
     assert state.vertices is not None
     vertices, known = state.vertices, np.isfinite(albedo).all(1)
@@ -332,8 +323,8 @@ def _material(state: _State, albedo: Float, lights: list[DirectionalLights], sha
     normal = normalise(vertices.normal.double().cpu().numpy())
     normal[~known] = vertex_normals(state.surface)[~known]
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
-    certain = confidence(state.views, vertices, lights, sharpness).double().cpu().numpy()
-    return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.where(known, certain, 0))
+    certain = confidence(state.views, vertices, lights, state.law).double().cpu().numpy()
+    return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.where(known, certain, 0), state.law.grazing, state.law.bounce)
 
 
 def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:

@@ -6,7 +6,7 @@ grey prediction P outweighs the lobes (they may have the light's colour, the alb
     radiance_c / e = g_c r_c P,     weights (d / P)^2 on top of the robust ones
 
 is linear in g and in r, which are solved in turn as robust ratios of sums. One factor per channel is free: r has mean one over the lights.
-With r known, the albedo of a channel is linear too:  radiance_c / (e r_c) = a_c q + sum_k w_k q E_k,   q = max(n.l, 0).
+With r known, the albedo of a channel is linear too:  radiance_c / (e r_c) = a_c q + sum_k w_k q_k,   q = dI/da and q_k of blocks.py.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mvps.camera import bilinear, project
 from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, evaluate, robust
 from mvps.joint.observe import ViewSamples
-from mvps.scene import Capture, Float, Surface, View
+from mvps.scene import Capture, Float, Law, Surface, View
 
 COLOUR_SWEEPS = 3
 PAIRS_PER_CHUNK = 2048
@@ -44,7 +43,7 @@ def _sums(
     surface: Surface,
     vertices: Vertices,
     lights: DirectionalLights,
-    sharpness: torch.Tensor,
+    law: Law,
     ratio: NDArray[np.float32],
     colour: NDArray[np.float32],
 ) -> _Sums:
@@ -53,7 +52,7 @@ def _sums(
     for start in range(0, n, PAIRS_PER_CHUNK):
         part = slice(start, start + PAIRS_PER_CHUNK)
         index, towards = samples.vertex[part], samples.towards[part]
-        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, sharpness)
+        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, law, samples.gathered_of(part))
         weight = samples.weight[part, None] * samples.data[part] * robust(shaded.predicted - samples.image[part], vertices.scale[index])
         w, q, predicted = (t.cpu().numpy() for t in (weight, shaded.basis[0], shaded.predicted))
         diffuse = q * vertices.reflectance[index, :1].cpu().numpy()
@@ -77,7 +76,7 @@ def colours(
     views: list[ViewSamples],
     vertices: Vertices,
     lights: list[DirectionalLights],
-    sharpness: torch.Tensor,
+    law: Law,
     ratios: list[Float],
     one_rig: bool,
 ) -> tuple[NDArray[np.float64], list[Float]]:
@@ -87,7 +86,7 @@ def colours(
     def gather(now: NDArray[np.float32]) -> list[_Sums]:
         tasks = list(zip(capture.views, views, lights, ratios, strict=True))
         with ThreadPoolExecutor(WORKERS) as pool:
-            return list(pool.map(lambda t: _sums(t[0], t[1], surface, vertices, t[2], sharpness, t[3].astype(np.float32), now), tasks))
+            return list(pool.map(lambda t: _sums(t[0], t[1], surface, vertices, t[2], law, t[3].astype(np.float32), now), tasks))
 
     for _ in range(COLOUR_SWEEPS):
         sums = gather(colour)

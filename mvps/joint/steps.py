@@ -16,6 +16,7 @@ from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
 from mvps.joint.observe import ViewSamples
+from mvps.scene import Law
 from solvers.least_squares import bounded_step, damped
 
 LARGEST_TURN = 0.3
@@ -45,12 +46,10 @@ def free_reflectance(normal: Tensor, sigma: float, unknowns: int) -> Anchor:
     return Anchor(normal, sigma, nothing, nothing + torch.inf)
 
 
-def with_population(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor
-) -> Anchor:
+def with_population(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor) -> Anchor:
     """The anchor with every lobe's weight tied to the object's: mean and standard deviation over the vertices, each by what its samples say
     of that lobe (empirical Bayes). A lobe that no light has excited at a vertex would otherwise be free, and blaze under another light."""
-    equations = vertex_equations(views, vertices, lights, sharpness)
+    equations = vertex_equations(views, vertices, lights, law)
     said = torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:].double()
     share = said / said.sum(0).clamp_min(1e-300)
     mean = (share * vertices.reflectance).sum(0)
@@ -74,11 +73,9 @@ def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> 
     equations.gradient[:, 2:] += strength * (vertices.reflectance - anchor.reflectance)
 
 
-def vertex_step(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor, anchor: Anchor
-) -> Vertices:
+def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor) -> Vertices:
     """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
-    equations = vertex_equations(views, vertices, lights, sharpness)
+    equations = vertex_equations(views, vertices, lights, law)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
     vertices = replace(vertices, scale=scale.clamp_min(LEAST_SCALE * float(scale.median())))
     add_ties(equations, vertices, anchor)
@@ -91,12 +88,12 @@ def vertex_step(
     return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale)
 
 
-def confidence(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], sharpness: Tensor) -> Tensor:
+def confidence(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> Tensor:
     """(V,) confidence in the normals: 1 / (1 + (sigma / RELIABLE)^2), sigma from the inverse of the normal equations.
 
     The covariance is taken per sample: a vertex's samples share the model's error, so their number does not reduce it. 0 without samples.
     """
-    equations = vertex_equations(views, vertices, lights, sharpness)
+    equations = vertex_equations(views, vertices, lights, law)
     inverse = torch.linalg.inv(damped(equations.hessian, 1e-3).double())
     variance = (inverse[:, 0, 0] + inverse[:, 1, 1]).clamp_min(0) / 2 * vertices.scale.double() ** 2 * equations.count
     reliable: Tensor = 1 / (1 + variance / RELIABLE**2)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.mesh import mean_edge_length
 from mvps.pbr import reflectance_scale, srgb_bytes
-from mvps.rendering import photograph, points_under, shadow_at
+from mvps.rendering import light_arriving, light_sources, photograph, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View
 from mvps.visibility import RayCaster
 
@@ -43,7 +43,8 @@ def view_pictures(caster: RayCaster, reconstruction: Reconstruction, view: View)
     direction, intensity = (values[place][row : row + 1] for values in (reconstruction.lights.direction, reconstruction.lights.intensity))
     material, offset = reconstruction.material, mean_edge_length(caster.surface)
     measured = view.radiance([chosen])[:, 0]
-    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset)[:, 0]
+    arriving = light_arriving(light_sources(caster.surface, material), material, direction)
+    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset, arriving)[:, 0]
     dark = replace(material, albedo=np.zeros_like(material.albedo))
     specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity, offset)[:, 0]
     points = points_under(caster, material, view.camera, view.pixels)
