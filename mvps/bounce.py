@@ -76,7 +76,11 @@ class Sources:
 
 def coarse_sources(surface: Surface, albedo: Float) -> Sources:
     """The sources of a surface whose vertices have `albedo` (V,) or (V, channels)."""
-    of = gather(surface, COARSE_EDGES * mean_edge_length(surface))
+    return sources_on(gather(surface, COARSE_EDGES * mean_edge_length(surface)), surface, albedo)
+
+
+def sources_on(of: Gather, surface: Surface, albedo: Float) -> Sources:
+    """The same on the coarse mesh of an earlier surface that is about the same."""
     weight = interpolation(of, surface.vertices, vertex_normals(surface)).T.tocsr()
     total = np.asarray(weight.sum(1))[:, 0]
     near = total > 1e-6

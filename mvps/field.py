@@ -163,6 +163,18 @@ class OccupancyField(nn.Module):
         return distance
 
 
+class SampledField:
+    """A field's signed distance on the nodes of one grid, interpolated in between."""
+
+    def __init__(self, values: Tensor, grid: Lattice) -> None:
+        """values (nodes, 1)."""
+        self.values, self.grid = values, grid
+
+    def signed_distance(self, points: Tensor) -> Tensor:
+        """(n,) signed distance at points (n, 3)."""
+        return interpolate(self.values, points, self.grid).view(-1)
+
+
 def gradient(field: Any, points: Tensor, step: float) -> tuple[Tensor, Tensor]:
     """Gradient (n, 3) and mean (n,) of the field's signed distance over a tetrahedron of half-edge `step` around points (n, 3)."""
     offset = torch.tensor(TETRAHEDRON, device=points.device, dtype=points.dtype)

@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from mvps.camera import pixel_centres, rays
-from mvps.field import OccupancyField
+from mvps.field import OccupancyField, SampledField
 from mvps.scene import Bool, Camera, Capture, Float, Int, NormalMap
 
 NEAR_ENOUGH = 0.25
@@ -81,7 +81,7 @@ def ring_rays(capture: Capture, centre: Float, unit: float, ring: int) -> FieldR
 
 
 @torch.no_grad()
-def trace(field: OccupancyField, anchor: Tensor, direction: Tensor, low: Tensor, high: Tensor, through: bool) -> Tensor:
+def trace(field: OccupancyField | SampledField, anchor: Tensor, direction: Tensor, low: Tensor, high: Tensor, through: bool) -> Tensor:
     """(n,) distance of the field's first surface along rays within the box low, high, or of the closest approach where there is none.
 
     through: the closest approach along the whole ray, not stopping at the first surface.

@@ -23,6 +23,7 @@ All lengths are in pixel footprints at the object, so that the capture's unit do
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,7 @@ import torch
 from torch import Tensor
 
 from mvps.camera import pixel_footprint
-from mvps.field import Lattice, OccupancyField, gradient, lattice
+from mvps.field import Lattice, OccupancyField, SampledField, gradient, lattice
 from mvps.fieldrays import FieldRays, foreground_rays, ring_rays, trace
 from mvps.mesh import largest_component
 from mvps.scene import Capture, Float, NormalMap, SignedDistanceGrid, Surface
@@ -42,6 +43,15 @@ COARSE_FACTOR = 4
 """Coarse cells of the surface's grid are this many fine ones wide; the field is evaluated finely only near its level set."""
 
 POINTS_PER_CALL = 1 << 16
+
+PARTS = 2
+"""Parts of a batch, a thread each: fixed, because the order of a sum is part of its value."""
+
+TRACED = 2.5
+"""Cells, pixels, of the grid on which rays find the surface: the band of samples around what they find is wider than its error."""
+
+SMOOTHED = 4
+"""Every so many rays one asks for smoothness."""
 
 
 @dataclass(frozen=True)
@@ -119,72 +129,113 @@ def _between(pair: tuple[float, float], progress: float) -> float:
     return float(pair[0] * (pair[1] / pair[0]) ** min(1.0, progress))
 
 
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """A random part of the rays: their numbers (n,), shift of their samples (n, 1), steps aside (n / SMOOTHED, 3) for smoothness."""
+
+    chosen: Tensor
+    jitter: Tensor
+    aside: Tensor
+
+
 class _Training:
-    """The field, its rays with the surface's distance last seen along each, and the optimiser."""
+    """The field, its rays with the surface's distance last seen along each, the optimiser, and the threads that share the work."""
 
     def __init__(
         self, field: OccupancyField, frame: _Frame, data: FieldRays, ring: FieldRays, settings: OccupancySettings, seed: int
     ) -> None:
         self.field, self.frame, self.data, self.ring, self.settings = field, frame, data, ring, settings
         self.generator = torch.Generator().manual_seed(seed)
+        self.pool_of_threads = ThreadPoolExecutor(PARTS)
         self.seen = torch.zeros(len(data.anchor))
         self.ring_seen = torch.zeros(len(ring.anchor))
         self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long)
         small = [field.first, field.first_bias, field.last, field.last_bias]
         groups = [{"params": [field.table], "lr": settings.grid_rate}, {"params": small, "lr": settings.network_rate}]
         # A tiny epsilon: a node's gradients are small only because few rays pass it.
-        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12)
+        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
 
     def widen(self, stride: int) -> None:
         """Take in the pixels of this stride and find the surface along their rays anew."""
         low, high = self.frame.low, self.frame.high
+        values = sampled(self.field, low, high, TRACED)
+        nodes = Lattice(low, torch.tensor([TRACED]), torch.tensor([values.shape]), torch.tensor([0]))
+        frozen = SampledField(values.reshape(-1, 1), nodes)
         self.pool = (self.data.stride >= stride).nonzero()[:, 0]
         self.ring_pool = (self.ring.stride >= min(stride, 2)).nonzero()[:, 0]
-        self.seen[self.pool] = trace(self.field, self.data.anchor[self.pool], self.data.direction[self.pool], low, high, through=False)
-        chosen = self.ring_pool
-        self.ring_seen[chosen] = trace(self.field, self.ring.anchor[chosen], self.ring.direction[chosen], low, high, through=True)
 
-    def march(self, rays: FieldRays, chosen: Tensor, around: Tensor, band: float, samples: int) -> tuple[Tensor, Tensor, Tensor]:
+        def traced(rays: FieldRays, chosen: Tensor, through: bool) -> Tensor:
+            parts = self.pool_of_threads.map(
+                lambda c: trace(frozen, rays.anchor[c], rays.direction[c], low, high, through), chosen.chunk(PARTS)
+            )
+            return torch.cat(list(parts))
+
+        self.seen[self.pool] = traced(self.data, self.pool, False)
+        self.ring_seen[self.ring_pool] = traced(self.ring, self.ring_pool, True)
+
+    def march(self, rays: FieldRays, draw: _Draw, around: Tensor, band: float, samples: int) -> tuple[Tensor, Tensor, Tensor]:
         """Jittered distances, signed distances (rays, samples) and colours (rays, samples, COLOURS) in a band around a distance."""
-        jitter = torch.rand(len(chosen), 1, generator=self.generator)
-        distance = around[:, None] + band * ((torch.arange(samples) + jitter) / samples * 2 - 1)
-        points = rays.anchor[chosen][:, None] + distance[..., None] * rays.direction[chosen][:, None]
+        distance = around[:, None] + band * ((torch.arange(samples) + draw.jitter) / samples * 2 - 1)
+        points = rays.anchor[draw.chosen][:, None] + distance[..., None] * rays.direction[draw.chosen][:, None]
         value, colour = self.field(points.view(-1, 3))
         return distance, value.view(-1, samples), colour.view(-1, samples, COLOURS)
 
-    def _draw(self, pool: Tensor, count: int) -> Tensor:
-        return pool[torch.randint(len(pool), (count,), generator=self.generator)]
+    def _draw(self, pool: Tensor, count: int) -> list[_Draw]:
+        """Rays drawn from a pool, dealt into PARTS."""
+        chosen = pool[torch.randint(len(pool), (count,), generator=self.generator)]
+        jitter = torch.rand(count, 1, generator=self.generator)
+        aside = torch.randn(count // SMOOTHED, 3, generator=self.generator)
+        return [_Draw(*values) for values in zip(*(v.chunk(PARTS) for v in (chosen, jitter, aside)), strict=True)]
 
-    def mask_loss(self, band: float, width: float) -> Tensor:
-        """Cross-entropy of the opacity along rays of the ring."""
-        chosen = self._draw(self.ring_pool, self.settings.ring_rays)
-        distance, value, _ = self.march(self.ring, chosen, self.ring_seen[chosen], band, self.settings.ring_samples)
+    def mask_loss(self, draw: _Draw, band: float, width: float) -> tuple[Tensor, Tensor]:
+        """Cross-entropy of the opacity along rays of the ring, and the distance of their closest approach."""
+        distance, value, _ = self.march(self.ring, draw, self.ring_seen[draw.chosen], band, self.settings.ring_samples)
         _, opacity = composite(value, width)
-        self.ring_seen[chosen] = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
-        return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-4, 1 - 1e-4), self.ring.inside[chosen])
+        nearest = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
+        return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-4, 1 - 1e-4), self.ring.inside[draw.chosen]), nearest
 
-    def surface_loss(self, band: float, width: float, step: float) -> Tensor:
-        """Normal, colour and smoothness along rays of foreground pixels."""
-        s, data = self.settings, self.data
-        chosen = self._draw(self.pool, s.rays)
-        distance, value, colour = self.march(data, chosen, self.seen[chosen], band, s.samples)
+    def surface_loss(self, draw: _Draw, band: float, width: float, step: float) -> tuple[Tensor, Tensor]:
+        """Normal, colour and smoothness along rays of foreground pixels, and where they meet the surface."""
+        s, data, chosen = self.settings, self.data, draw.chosen
+        distance, value, colour = self.march(data, draw, self.seen[chosen], band, s.samples)
         weight, opacity = composite(value, width)
         middle = torch.cat([distance[:, :1], (distance[:, 1:] + distance[:, :-1]) / 2], 1)
         depth = crossing(distance, value, (weight * middle).sum(1) / weight.sum(1).clamp_min(1e-4))
         nearest = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
-        self.seen[chosen] = torch.where(opacity > 0.5, depth, nearest).detach()
         x = data.anchor[chosen] + depth[:, None] * data.direction[chosen]
-        few = s.rays // 4
-        beside = x[:few].detach() + torch.randn(few, 3, generator=self.generator) * step
-        normals, _ = gradient(self.field, torch.cat([x, beside]), step)
-        normal, other = normals[: s.rays], normals[s.rays :]
+        few = len(draw.aside)
+        normals, _ = gradient(self.field, torch.cat([x, x[:few].detach() + draw.aside * step]), step)
+        normal, other = normals[: len(x)], normals[len(x) :]
         hit = (opacity.detach() > 0.5).float()
         trust = data.weight[chosen] * hit
         rendered = (weight[:, :, None] * colour).sum(1) / opacity[:, None].clamp_min(1e-3)
         of_normal = (trust * robust_square((normal - data.normal[chosen]).square().sum(1), s.outlier)).mean()
         of_colour = (trust * robust_square((rendered - data.colour[chosen]).square().sum(1), s.outlier)).mean()
         of_smooth = (hit[:few] * robust_square((normal[:few] - other).square().sum(1), s.outlier)).mean()
-        return s.normal * of_normal + s.colour * of_colour + s.smooth * of_smooth
+        loss = s.normal * of_normal + s.colour * of_colour + s.smooth * of_smooth
+        return loss, torch.where(opacity > 0.5, depth, nearest).detach()
+
+    def step(self, band: float, width: float, step: float) -> float:
+        """One step of the optimiser; the loss. The parts of a batch are independent and run on a core each."""
+        s = self.settings
+        draws, ring_draws = self._draw(self.pool, s.rays), self._draw(self.ring_pool, s.ring_rays)
+        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
+
+        def part(k: int) -> tuple[float, tuple[Tensor, ...], Tensor, Tensor]:
+            loss, seen = self.surface_loss(draws[k], band, width, step)
+            of_mask, ring_seen = self.mask_loss(ring_draws[k], band, width)
+            total = (loss + s.mask * of_mask) / PARTS
+            return float(total.detach()), torch.autograd.grad(total, parameters), seen, ring_seen
+
+        parts = list(self.pool_of_threads.map(part, range(PARTS)))
+        for draw, ring_draw, (_, _, seen, ring_seen) in zip(draws, ring_draws, parts, strict=True):
+            self.seen[draw.chosen], self.ring_seen[ring_draw.chosen] = seen, ring_seen
+        for p, *of_parts in zip(parameters, *(gradients for _, gradients, _, _ in parts), strict=True):
+            p.grad = of_parts[0]
+            for more in of_parts[1:]:
+                p.grad += more
+        self.optimiser.step()
+        return sum(loss for loss, *_ in parts)
 
     def run(self, on_step: Callable[[int, float], None]) -> None:
         """All steps: every 4th, then 2nd, then each pixel; grids from coarse to fine; rates that rise shortly and fall to a 20th."""
@@ -198,11 +249,7 @@ class _Training:
             band, width, step = (_between(pair, 1.5 * progress) for pair in (s.band, s.width, s.step))
             for group, rate in zip(self.optimiser.param_groups, (s.grid_rate, s.network_rate), strict=True):
                 group["lr"] = rate * min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
-            loss = self.surface_loss(band, width, step) + s.mask * self.mask_loss(band, width)
-            self.optimiser.zero_grad(set_to_none=True)
-            loss.backward()
-            self.optimiser.step()
-            on_step(k, float(loss.detach()))
+            on_step(k, self.step(band, width, step))
 
 
 def _frame(capture: Capture, grid: SignedDistanceGrid) -> _Frame:
@@ -247,14 +294,15 @@ def occupancy_field(
     field = _field(hull_grid, frame, settings, seed)
     data = foreground_rays(capture, normal_maps, frame.centre, frame.unit)
     ring = ring_rays(capture, frame.centre, frame.unit, settings.ring)
-    _Training(field, frame, data, ring, settings, seed).run(on_step)
+    training = _Training(field, frame, data, ring, settings, seed)
+    with training.pool_of_threads:
+        training.run(on_step)
     return extract(field, frame.low, frame.high, settings.voxel, frame.centre, frame.unit)
 
 
 @torch.no_grad()
-def extract(field: OccupancyField, low: Tensor, high: Tensor, voxel: float, centre: Float, unit: float) -> Surface:
-    """The field's zero level set on a grid of `voxel`, its largest component, faces outwards, world = centre + unit * local."""
-    from skimage.measure import marching_cubes
+def sampled(field: OccupancyField, low: Tensor, high: Tensor, voxel: float) -> Tensor:
+    """Signed distance on a grid of `voxel` from low (3,) to beyond high (3,); far from the surface interpolated from a coarse grid."""
 
     def values(points: Tensor) -> Tensor:
         return torch.cat([field.signed_distance(part) for part in points.split(POINTS_PER_CALL)])
@@ -267,6 +315,13 @@ def extract(field: OccupancyField, low: Tensor, high: Tensor, voxel: float, cent
     fine = torch.nn.functional.interpolate(coarse[None, None], size=fine_size, mode="trilinear", align_corners=True)[0, 0]
     near = fine.abs() < cell
     fine[near] = values(low + voxel * near.nonzero().float())
-    vertices, faces, _, _ = marching_cubes(fine.numpy(), 0.0)
+    return fine
+
+
+def extract(field: OccupancyField, low: Tensor, high: Tensor, voxel: float, centre: Float, unit: float) -> Surface:
+    """The field's zero level set on a grid of `voxel`, its largest component, faces outwards, world = centre + unit * local."""
+    from skimage.measure import marching_cubes
+
+    vertices, faces, _, _ = marching_cubes(sampled(field, low, high, voxel).numpy(), 0.0)
     local = low.numpy().astype(np.float64) + voxel * vertices.astype(np.float64)
     return largest_component(Surface(centre + unit * local, faces))

@@ -30,13 +30,14 @@ def bounded_step(hessian: Tensor, gradient: Tensor, lower: Tensor, damping: floa
     """Steps d (n, p) for H (n, p, p), g (n, p), lower (n, p) <= 0 (-inf where free)."""
     H = damped(hessian, damping)
     fixed = torch.zeros_like(gradient, dtype=torch.bool)
-    step = torch.zeros_like(gradient)
-    for _ in range(gradient.shape[1] + 1):
-        step = _solve_with_fixed(H, gradient, lower, fixed)
+    step = _solve_with_fixed(H, gradient, lower, fixed)
+    for _ in range(gradient.shape[1]):
         violated = (step < lower) & ~fixed
-        if not violated.any():
+        rows = violated.any(1).nonzero()[:, 0]
+        if not len(rows):
             break
-        fixed = fixed | violated
+        fixed[rows] |= violated[rows]
+        step[rows] = _solve_with_fixed(H[rows], gradient[rows], lower[rows], fixed[rows])
     return torch.maximum(step, lower)
 
 

@@ -46,8 +46,7 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
     few = []
     for s in views:
         rows = torch.nonzero(place[s.vertex] >= 0)[:, 0]
-        gathered = None if s.gathered is None else s.gathered[rows]
-        few.append(ViewSamples(place[s.vertex[rows]], s.towards[rows], s.weight[rows], s.image[rows], s.data[rows], gathered))
+        few.append(replace(s.of_pairs(rows), vertex=place[s.vertex[rows]]))
     state = Vertices(vertices.normal[chosen], vertices.reflectance[chosen], vertices.scale[chosen])
     tie = Anchor(anchor.normal[chosen], anchor.sigma, anchor.reflectance[chosen], anchor.reflectance_sigma[chosen])
     return few, state, tie

@@ -19,18 +19,20 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import scipy.sparse as sp
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvps.bounce import coarse_sources, gathered, interpolation
+from mvps.bounce import Sources, gathered, interpolation
 from mvps.camera import bilinear, project, view_directions
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, cast_shadow, visible_vertices
 
-SAMPLES_PER_CHUNK = 1 << 15
-"""Samples handled at once: a float32 array of them takes 128 KB, so that the dozen of a chunk stay in a core's cache."""
+SAMPLES_PER_CHUNK = 1 << 17
+"""Samples handled at once: the dozen arrays of a chunk, half a megabyte each, stay in a processor's last cache, and the interpreter's
+time for an operation, some microseconds, stays below a tenth of the operation's own (measured: docs/method.md)."""
 
 
 LIGHTEST_PAIR = 1e-3
@@ -57,6 +59,11 @@ class ViewSamples:
         """`gathered` of some pairs."""
         return None if self.gathered is None else self.gathered[part]
 
+    def of_pairs(self, rows: Tensor) -> ViewSamples:
+        """Only some of the pairs."""
+        gathered = None if self.gathered is None else self.gathered[rows]
+        return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered)
+
     def chunks(self) -> Iterator[slice]:
         """Slices of the pairs that hold about SAMPLES_PER_CHUNK samples."""
         step = max(1, SAMPLES_PER_CHUNK // max(1, self.image.shape[1]))
@@ -76,18 +83,22 @@ def channel_ratio(intensity: Float) -> Float:
     return ratio
 
 
-def sample_grey(view: View, ratio: Float, positions: Int, weights: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Grey radiance (n, lights) at bilinear positions, weights (n, 4) of the foreground list, and whether all four are unsaturated."""
-    per_channel = (view.scale / (3 * ratio)).astype(np.float32)
-    image = np.empty((len(positions), len(view.lights)), np.float32)
-    usable = np.empty(image.shape, bool)
-    for start in range(0, len(positions), 4096):
-        part = slice(start, start + 4096)
-        corners = view.samples[positions[part]]
-        usable[part] = ((corners.max(-1) < view.saturation) | (weights[part, :, None] == 0)).all(1)
-        grey = np.einsum("pklc,lc->pkl", corners.astype(np.float32), per_channel)
-        image[part] = np.einsum("pkl,pk->pl", grey, weights[part])
-    return image, usable
+def grey_radiance(view: View, intensity: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Of a view's foreground pixels (pixels, lights): grey radiance, what is left of a light being its mean intensity, and where no
+    channel is saturated."""
+    per_channel = (view.scale / (3 * channel_ratio(intensity))).astype(np.float32)
+    return np.einsum("plc,lc->pl", view.samples, per_channel), view.usable()
+
+
+def _sampled(
+    image: NDArray[np.float32], usable: NDArray[np.bool_], positions: Int, weights: Float
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Grey radiance (n, lights) at bilinear positions, weights (n, 4) of the foreground list, and whether all four are usable."""
+    corners = sp.csr_matrix(
+        (weights.astype(np.float32).ravel(), positions.ravel(), np.arange(0, positions.size + 1, 4)), (len(positions), len(image))
+    )
+    lost = (corners @ (~usable).astype(np.float32)) > 0 if not usable.all() else np.zeros((len(positions), image.shape[1]), bool)
+    return corners @ image, ~lost
 
 
 def _pairs(view: View, caster: RayCaster, normal: Float, offset: float) -> tuple[Int, Float, Int, Float]:
@@ -116,7 +127,7 @@ def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.de
         view = capture.views[i]
         vertex, pair, positions, weights = _pairs(view, caster, normal, offset)
         towards = view_directions(view.camera, surface.vertices[vertex])
-        image, usable = sample_grey(view, channel_ratio(lights.intensity[i]), positions, weights)
+        image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
         shadow = cast_shadow(caster, vertex, normal, lights.direction[i], offset)
         return ViewSamples(
             torch.from_numpy(vertex).to(device),
@@ -130,9 +141,8 @@ def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.de
         return list(pool.map(one, range(len(capture.views))))
 
 
-def with_gathered(views: list[ViewSamples], surface: Surface, albedo: Float, bounce: float, lights: Lights) -> list[ViewSamples]:
-    """The samples with what other surfaces send to them, for albedo (V,), the law's bounce and the lights."""
-    sources = coarse_sources(surface, albedo)
+def with_gathered(views: list[ViewSamples], surface: Surface, sources: Sources, bounce: float, lights: Lights) -> list[ViewSamples]:
+    """The samples with what other surfaces send to them, for the law's bounce and the lights."""
     weight = interpolation(sources.of, surface.vertices, vertex_normals(surface))
 
     def one(i: int) -> ViewSamples:

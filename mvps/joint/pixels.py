@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvps.bounce import Sources, at, coarse_sources, gathered
+from mvps.bounce import Sources, at, gathered
 from mvps.camera import view_directions
 from mvps.joint.blocks import DirectionalLights, Vertices
-from mvps.joint.observe import ViewSamples, channel_ratio
+from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_step
 from mvps.mesh import mean_edge_length, normalise
 from mvps.rendering import Points, points_under, shadow_at
@@ -33,12 +33,12 @@ ALBEDO_TIE, WEIGHT_TIE = 0.3, 0.05
 """Standard deviation of a pixel's albedo over the vertices' albedo, and of a lobe's weight over albedo plus weight. Albedo has edges that a
 mesh blurs; one view's lights hardly tell a lobe from a turned normal, so lobes keep close to what all views say."""
 
-STEPS = 4
+STEPS = 3
 
 
 def _samples(view: View, points: Points, shadow: Bool, intensity: Float, hit: Int) -> ViewSamples:
-    image = (view.samples[hit] * (view.scale / (3 * channel_ratio(intensity))).astype(np.float32)).sum(-1)
-    data = (view.samples[hit] < view.saturation).all(-1) & ~shadow[hit]
+    image, usable = grey_radiance(view, intensity)
+    image, data = image[hit], usable[hit] & ~shadow[hit]
     towards = view_directions(view.camera, points.position[hit]).astype(np.float32)
     n = len(hit)
     return ViewSamples(torch.arange(n), torch.from_numpy(towards), torch.ones(n), torch.from_numpy(image), torch.from_numpy(data))
@@ -89,10 +89,11 @@ def pixel_normals(
     return NormalMap(normals, albedo, certain)
 
 
-def all_pixel_normals(capture: Capture, surface: Surface, material: Material, lights: Lights) -> tuple[NormalMap, ...]:
+def all_pixel_normals(
+    capture: Capture, surface: Surface, material: Material, lights: Lights, sources: Sources | None
+) -> tuple[NormalMap, ...]:
     """`pixel_normals` of every view, on all cores."""
     caster, offset = RayCaster(surface), mean_edge_length(surface)
-    sources = coarse_sources(surface, material.albedo.mean(1)) if material.bounce else None
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         tasks = zip(capture.views, lights.direction, lights.intensity, strict=True)
         return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, task[1], task[2], offset), tasks))

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mvps.bounce import COARSE_EDGES, Gather, gather, sources_on
 from mvps.camera import bilinear, pixel_footprint, project
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.lights import light_step, subset, with_mean_one
@@ -23,7 +24,7 @@ from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import colours
 from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step, with_population
 from mvps.joint.vertices import Agreement, agreement, fuse
-from mvps.mesh import isotropic_remesh, normalise, vertex_normals
+from mvps.mesh import isotropic_remesh, mean_edge_length, normalise, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
 SHARPNESS = (8.0, 32.0, 128.0)
@@ -96,6 +97,7 @@ class _State:
     maps: tuple[NormalMap, ...]
     law: Law
     vertices: Vertices | None = None
+    coarse: Gather | None = None
     views: list[ViewSamples] = field(default_factory=list)
 
 
@@ -209,8 +211,10 @@ def _photometric_round(
     lights = grey_lights(state.lights, device)
     for _ in range(MATERIAL_STEPS):
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
-    albedo = vertices.reflectance[:, 0].double().cpu().numpy()
-    state.views = with_gathered(state.views, state.surface, albedo, state.law.bounce, state.lights)
+    if state.coarse is None:
+        state.coarse = gather(state.surface, COARSE_EDGES * mean_edge_length(state.surface))
+    sources = sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
+    state.views = with_gathered(state.views, state.surface, sources, state.law.bounce, state.lights)
     free = with_population(state.views, vertices, lights, state.law, free)
     solved = _solve_lights(state, vertices, replace(free, sigma=LIGHT_TIE), capture, settings, generator, device)
     moved = light_change(state.lights, solved)
@@ -221,7 +225,7 @@ def _photometric_round(
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
     grey = vertices.reflectance[:, :1].double().cpu().numpy().repeat(3, axis=1)
-    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey, lights), state.lights)
+    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey, lights), state.lights, sources)
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (_angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     return {

@@ -25,6 +25,9 @@ LARGEST_TURN = 0.3
 RELIABLE = 0.05
 """Standard deviation of a normal, radians, at which confidence is one half (as in photometric.py)."""
 
+CORRELATED = 6.0
+"""Samples that share one error of the model: measured errors of normals are 2 to 3 times what independent samples would give."""
+
 LEAST_SCALE = 0.1
 """Smallest scale of a vertex's residuals over the median one: a vertex with few samples may fit them exactly by chance."""
 
@@ -91,10 +94,11 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
 def confidence(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> Tensor:
     """(V,) confidence in the normals: 1 / (1 + (sigma / RELIABLE)^2), sigma from the inverse of the normal equations.
 
-    The covariance is taken per sample: a vertex's samples share the model's error, so their number does not reduce it. 0 without samples.
+    Residuals are the model's error rather than noise, and samples under neighbouring lights share it: CORRELATED of them count as one.
+    0 without samples.
     """
     equations = vertex_equations(views, vertices, lights, law)
     inverse = torch.linalg.inv(damped(equations.hessian, 1e-3).double())
-    variance = (inverse[:, 0, 0] + inverse[:, 1, 1]).clamp_min(0) / 2 * vertices.scale.double() ** 2 * equations.count
+    variance = (inverse[:, 0, 0] + inverse[:, 1, 1]).clamp_min(0) / 2 * vertices.scale.double() ** 2 * CORRELATED
     reliable: Tensor = 1 / (1 + variance / RELIABLE**2)
     return torch.where(equations.count > 0, torch.nan_to_num(reliable), 0.0)

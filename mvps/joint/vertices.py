@@ -166,10 +166,11 @@ def fuse(surface: Surface, normal: Float, agreed: Agreement, normal_sigma: float
     rest = 1e-4 * float(np.median(weight[weight > 0])) if (weight > 0).any() else 1.0
     y = x
     robust = np.ones(len(x))
+    # Reweighting changes the diagonal alone: the first factor stays a good preconditioner.
+    factor = CholeskyLike(L + sp.diags(weight + rest))
     for _ in range(sweeps):
-        w = weight * robust + rest
-        factor = CholeskyLike(L + sp.diags(w))
-        y = factor.solve(right + (weight * robust)[:, None] * agreed_at + rest * x)
+        held = weight * robust
+        y = factor.nearby(L + sp.diags(held + rest), right + held[:, None] * agreed_at + rest * x, y)
         away = np.abs(((y - agreed_at) * outward).sum(1))
         robust = 1 / (1 + (away / (FAR_OFF * sigma)) ** 2)
     return Surface(y, surface.faces)
