@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from mvps.scene import Float, Int, Surface
+from mvps.scene import Bool, Float, Int, Surface
 
 
 def face_cross(surface: Surface) -> Float:
@@ -108,6 +108,30 @@ def largest_component(surface: Surface) -> Surface:
     _, label = connected_components(graph, directed=False)
     area = np.bincount(label[surface.faces[:, 0]], face_areas(surface))
     return without_unused_vertices(Surface(surface.vertices, surface.faces[label[surface.faces[:, 0]] == area.argmax()]))
+
+
+def split_edges(surface: Surface, marked: Bool) -> Surface:
+    """The surface with the marked ones of `edges(surface)` split in the middle; faces become two, three or four."""
+    pairs, n = edges(surface), len(surface.vertices)
+    middle = np.full(len(pairs), -1)
+    middle[marked] = n + np.arange(int(marked.sum()))
+    vertices = np.concatenate([surface.vertices, surface.vertices[pairs[marked]].mean(1)])
+    halves = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+    middles = middle[np.searchsorted(pairs[:, 0] * n + pairs[:, 1], halves[..., 0] * n + halves[..., 1])]
+    count = (middles >= 0).sum(1)
+    faces = [surface.faces[count == 0]]
+    for k in range(3):
+        # The face turned so that its first edge is the k-th: a b c with middles p on ab, q on bc.
+        turned, on = np.roll(surface.faces, -k, axis=1), np.roll(middles, -k, axis=1)
+        one = (count == 1) & (on[:, 0] >= 0)
+        (a, b, c), p = turned[one].T, on[one, 0]
+        faces += [np.stack(f, 1) for f in ((a, p, c), (p, b, c))]
+        two = (count == 2) & (on[:, 0] >= 0) & (on[:, 1] >= 0)
+        (a, b, c), (p, q) = turned[two].T, on[two, :2].T
+        faces += [np.stack(f, 1) for f in ((p, b, q), (a, p, c), (p, q, c))]
+    (a, b, c), (p, q, r) = surface.faces[count == 3].T, middles[count == 3].T
+    faces += [np.stack(f, 1) for f in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))]
+    return Surface(vertices, np.concatenate(faces))
 
 
 def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 3) -> Surface:

@@ -22,8 +22,8 @@ from solvers.low_rank import robust_weights, solve_rows
 SWEEPS = 12
 PIXELS_PER_CHUNK = 4096
 
-RELIABLE = 0.05
-"""Standard deviation of a normal, radians, at which confidence is one half: the error Lambert's law itself leaves on glossy objects."""
+RELIABLE = 0.2
+"""Standard deviation of a normal, radians, at which confidence is one half: there a normal no longer tells a slope from flat ground."""
 
 
 def grey(view: View, intensity: Float, part: slice) -> NDArray[np.float64]:

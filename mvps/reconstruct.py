@@ -57,8 +57,17 @@ def second_pass(preset: str, free_lights: bool) -> RefineSettings:
     """Rounds after Stage I; edges in pixels, sweeps reach as far as Stage I may be off."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    edges = {"draft": (1.5,), "standard": (1.5, 1.0), "fine": (1.5, 1.0, 0.75, 0.75)}[preset]
-    return RefineSettings(tuple(RoundSettings(edge, 1.2, 0.3) for edge in edges), free_lights=free_lights)
+    rounds = {
+        "draft": (RoundSettings(1.5, 1.8, 0.3),),
+        "standard": (RoundSettings(1.5, 1.8, 0.3), RoundSettings(1.0, 1.2, 0.3, crease=0.2)),
+        "fine": (
+            RoundSettings(1.5, 1.8, 0.3),
+            RoundSettings(1.0, 1.2, 0.3),
+            RoundSettings(0.8, 1.2, 0.3, crease=0.2),
+            RoundSettings(0.8, 0.6, 0.2, crease=0.1),
+        ),
+    }[preset]
+    return RefineSettings(rounds, free_lights=free_lights)
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:

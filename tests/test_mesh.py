@@ -65,3 +65,14 @@ def test_largest_component_is_kept_and_unused_vertices_go() -> None:
 def test_turning_the_faces_turns_the_volume_negative() -> None:
     ball = sphere(2)
     assert mesh.signed_volume(Surface(ball.vertices, ball.faces[:, ::-1])) < 0 < mesh.signed_volume(ball)
+
+
+def test_splitting_edges_keeps_a_mesh_closed_its_volume_and_its_orientation() -> None:
+    ball = sphere(3)
+    for share in (0.0, 0.3, 1.0):
+        marked = np.random.default_rng(0).random(len(mesh.edges(ball))) < share
+        split = mesh.split_edges(ball, marked)
+        assert mesh.is_closed(split) and len(split.vertices) == len(ball.vertices) + marked.sum()
+        assert np.isclose(mesh.signed_volume(split), mesh.signed_volume(ball)) and np.isclose(
+            mesh.face_areas(split).sum(), mesh.face_areas(ball).sum()
+        )

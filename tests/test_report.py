@@ -192,7 +192,7 @@ def test_views_and_lights_that_the_result_lacks_are_not_shown(scene: SphereScene
 
 def test_pictures_show_what_they_say(scene: SphereScene) -> None:
     """Photographs by the same image model: the error is black, the photograph and the re-rendering agree."""
-    light, pictures = view_pictures(RayCaster(scene.reconstruction.surface), scene.reconstruction, scene.capture.views[4])
+    light, pictures = view_pictures(RayCaster(scene.reconstruction.surface), None, scene.reconstruction, scene.capture.views[4])
     by_title = {picture.title: picture for picture in pictures}
     assert light.startswith("light ") and len(by_title) == 7
     error = by_title[f"error, white = {100 * ERROR_SPAN:.0f} %"]
@@ -203,7 +203,7 @@ def test_pictures_show_what_they_say(scene: SphereScene) -> None:
     assert by_title["normals"].image[middle][2] > 240 and (by_title["shadow"].image[middle] == 255).all()
     assert (error.image[middle] <= 1).all()
     wrong = replace(scene.reconstruction, material=replace(scene.reconstruction.material, albedo=scene.reconstruction.material.albedo * 3))
-    _, pictures = view_pictures(RayCaster(wrong.surface), wrong, scene.capture.views[4])
+    _, pictures = view_pictures(RayCaster(wrong.surface), None, wrong, scene.capture.views[4])
     assert pictures[2].image[middle].max() == 255
 
 

@@ -15,28 +15,30 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.bounce import COARSE_EDGES, Gather, gather, sources_on
-from mvps.camera import bilinear, pixel_footprint, project
+from mvps.bounce import PATCH_EDGES, Gather, gather, sources_on
+from mvps.camera import pixel_footprint
 from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.fused import face_targets, vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in, with_gathered
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import colours
 from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step, with_population
 from mvps.joint.vertices import Agreement, agreement, fuse
-from mvps.mesh import isotropic_remesh, mean_edge_length, normalise, vertex_normals
+from mvps.mesh import edges, isotropic_remesh, mean_edge_length, normalise, split_edges, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
 SHARPNESS = (8.0, 32.0, 128.0)
 """Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
 
-NORMAL_SIGMA = 0.05
-"""Standard deviation of refined normals, radians, in the fusion with positions."""
+NORMAL_SIGMA = 0.03
+"""Standard deviation of the views' normals, radians, in the fusion with positions: half of all pixels are better than 1 to 2 degrees."""
 
-POSITION_FLOOR_PIXELS = 0.2
+POSITION_FLOOR_PIXELS = 0.1
 """Smallest standard deviation of an agreed position: neighbouring costs share their pixels, so their agreement looks better than it is."""
 
 COST_SMOOTHINGS = 2
+FUSIONS = 2
 MATERIAL_STEPS = 3
 LIGHT_STEPS = 3
 WEAK_TIE = 0.3
@@ -57,12 +59,18 @@ POOR_FIT = 0.1
 @dataclass(frozen=True)
 class RoundSettings:
     """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
-    lights and vertices' normals and reflectance, or only fuse the views' photometric stereo."""
+    lights and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge
+    before it is split."""
 
     edge: float
     reach: float
     step: float
     photometric: bool = True
+    crease: float = np.inf
+
+    def offsets(self) -> Float:
+        """Offsets of the sweep, pixels."""
+        return np.arange(-self.reach, self.reach + self.step / 2, self.step)
 
 
 @dataclass(frozen=True)
@@ -126,19 +134,6 @@ def coloured_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig:
     return Lights(tuple(directions), tuple(intensities), one_rig)
 
 
-def fused_maps(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Any]) -> tuple[Float, Float, Float]:
-    """Normal (V, 3), grey albedo (V,) and weight (V,) of the vertices from the views' photometric stereo; weight 0 where unseen."""
-    normal = np.zeros((len(surface.vertices), 3))
-    albedo, total = np.zeros(len(normal)), np.zeros(len(normal))
-    for view, photometric, (index, weight) in zip(capture.views, maps, seen, strict=True):
-        positions, corners = bilinear(view.pixel_index, project(view.camera, surface.vertices[index])[0])
-        w = corners * photometric.confidence[positions] * weight[:, None]
-        normal[index] += (photometric.normal[positions] * w[..., None]).sum(1)
-        albedo[index] += (photometric.albedo.mean(1)[positions] * w).sum(1)
-        total[index] += w.sum(1)
-    return normalise(normal), albedo / np.maximum(total, 1e-12), total
-
-
 def _started(
     state: _State, capture: Capture, anchor: NDArray[Any], carried: tuple[Surface, Vertices] | None, device: torch.device
 ) -> Vertices:
@@ -148,7 +143,7 @@ def _started(
         old = carried[1]
         return Vertices(old.normal[nearest], old.reflectance[nearest], old.scale[nearest])
     seen = [(s.vertex.cpu().numpy(), s.weight.cpu().numpy()) for s in state.views]
-    normal, albedo, total = fused_maps(capture, state.surface, state.maps, seen)
+    normal, albedo, total = vertex_maps(capture, state.surface, state.maps, seen)
     normal = np.where(total[:, None] > 0, normal, anchor)
     reflectance = torch.zeros(len(normal), 1 + len(SHARPNESS), device=device)
     reflectance[:, 0] = _tensor(albedo, device)
@@ -212,7 +207,7 @@ def _photometric_round(
     for _ in range(MATERIAL_STEPS):
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     if state.coarse is None:
-        state.coarse = gather(state.surface, COARSE_EDGES * mean_edge_length(state.surface))
+        state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
     sources = sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
     state.views = with_gathered(state.views, state.surface, sources, state.law.bounce, state.lights)
     free = with_population(state.views, vertices, lights, state.law, free)
@@ -253,12 +248,28 @@ def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
     return float((vertices.scale[seen] / level).median())
 
 
-def _moved(
-    surface: Surface, normal: Float, state: _State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
-) -> Surface:
-    offsets = np.arange(-settings.reach, settings.reach + settings.step / 2, settings.step) * pixel
-    agreed: Agreement = agreement(capture, surface, state.maps, seen, offsets, COST_SMOOTHINGS)
-    return fuse(surface, normal, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel)
+def _moved(surface: Surface, otherwise: Float, state: _State, capture: Capture, seen: list[Any], reach: Float, pixel: float) -> Surface:
+    """The surface moved to where views agree, with their normals. otherwise (V, 3): normals where no view sees; reach: offsets, pixels."""
+    agreed: Agreement = agreement(capture, surface, state.maps, seen, reach * pixel, COST_SMOOTHINGS)
+    # Faces turn and move, so that other pixels speak for them: twice.
+    for _ in range(FUSIONS):
+        outward = vertex_normals(surface)
+        target = face_targets(capture, surface, state.maps, seen, otherwise)
+        moved = fuse(surface, target, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel)
+        agreed = Agreement(agreed.offset - ((moved.vertices - surface.vertices) * outward).sum(1), agreed.sigma)
+        surface = moved
+    return surface
+
+
+def _remeshed(surface: Surface, settings: RoundSettings, carried: tuple[Surface, Vertices] | None, pixel: float) -> Surface:
+    """The surface with edges as the round wants them."""
+    surface = isotropic_remesh(surface, settings.edge * pixel)
+    if carried is None or not np.isfinite(settings.crease):
+        return surface
+    nearest = cKDTree(carried[0].vertices).query(surface.vertices)[1]
+    normal = carried[1].normal.double().cpu().numpy()[nearest]
+    ends = normal[edges(surface)]
+    return split_edges(surface, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > settings.crease)
 
 
 def refine(
@@ -284,19 +295,14 @@ def refine(
     carried: tuple[Surface, Vertices] | None = None
     account: list[dict[str, float]] = []
     for number, round_settings in enumerate(settings.rounds, start=1):
-        state.surface = isotropic_remesh(state.surface, round_settings.edge * pixel)
+        state.surface = _remeshed(state.surface, round_settings, carried, pixel)
         mesh_normal = vertex_normals(state.surface)
         if round_settings.photometric:
             changes = _photometric_round(state, capture, settings, carried, generator, on)
-            assert state.vertices is not None
-            normal = normalise(state.vertices.normal.double().cpu().numpy())
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
-            pairs = visible_in(capture, state.surface)
-            fused, _, total = fused_maps(capture, state.surface, state.maps, pairs)
-            normal = np.where(total[:, None] > 0, fused, mesh_normal)
-            seen, changes = [index for index, _ in pairs], {}
-        moved = _moved(state.surface, normal, state, capture, seen, round_settings, pixel)
+            seen, changes = [index for index, _ in visible_in(capture, state.surface)], {}
+        moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings.offsets(), pixel)
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
         state.surface = moved

@@ -22,7 +22,7 @@ from solvers.least_squares import bounded_step, damped
 LARGEST_TURN = 0.3
 """Radians that a normal or light may turn in one step: the linearisation of n . l and of a lobe's flank ends there."""
 
-RELIABLE = 0.05
+RELIABLE = 0.2
 """Standard deviation of a normal, radians, at which confidence is one half (as in photometric.py)."""
 
 CORRELATED = 6.0

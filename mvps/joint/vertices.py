@@ -9,7 +9,7 @@ Fusion. Positions y minimise
 
     sum_f A_f |grad y - R_f grad x|^2 / (a sigma_n^2)  +  sum_i rho(|y_i - t_i| / sigma_i)
 
-R_f turns face f's normal to the photometric normal (mean of its corners); t_i is the agreed position, sigma_n the error of normals in
+R_f turns face f's normal to the views' (fused.py); t_i is the agreed position, sigma_n the error of normals in
 radians, a the mean area of a vertex (normals are independent from vertex to vertex). Its minimum is one sparse solve
 (cotangent weights: Yu et al. 2004; normals and positions together: Nehab et al. 2005): normals decide detail shorter than
 2 pi sigma / sigma_n, positions what is longer.
@@ -26,7 +26,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mvps.camera import project, view_directions
-from mvps.mesh import edges, face_areas, face_normals, normalise, vertex_normals
+from mvps.mesh import edges, face_areas, face_normals, vertex_normals
 from mvps.scene import Capture, Float, Int, NormalMap, Surface
 from solvers.linear import CholeskyLike
 
@@ -139,14 +139,13 @@ def rotations(source: Float, target: Float) -> Float:
     return rotated
 
 
-def fuse(surface: Surface, normal: Float, agreed: Agreement, normal_sigma: float, position_floor: float, sweeps: int = 3) -> Surface:
-    """The surface moved so that its faces follow `normal` (V, 3) and its vertices the agreed positions; same faces.
+def fuse(surface: Surface, target: Float, agreed: Agreement, normal_sigma: float, position_floor: float, sweeps: int = 3) -> Surface:
+    """The surface moved so that its faces follow `target` (F, 3), unit, and its vertices the agreed positions; same faces.
 
     normal_sigma radians; position_floor: smallest standard deviation of an agreed position, world units.
     """
     x = surface.vertices
     faces = np.ascontiguousarray(surface.faces)
-    target = normalise(normal[faces].sum(1))
     R = rotations(face_normals(surface), target)
     G = igl.grad(np.ascontiguousarray(x), faces)
     F = len(faces)

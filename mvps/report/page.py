@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.rendering import light_sources
 from mvps.report.charts import light_sphere, line_chart
 from mvps.report.pictures import data_address, view_pictures
 from mvps.scene import Capture, Reconstruction, View
@@ -139,10 +140,10 @@ def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
     views = _known_views(reconstruction, capture)
     if not views:
         return ""
-    caster = RayCaster(reconstruction.surface)
+    caster, sources = RayCaster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
     parts = []
     for view in views:
-        light, pictures = view_pictures(caster, reconstruction, view)
+        light, pictures = view_pictures(caster, sources, reconstruction, view)
         figures = "".join(
             f'<figure><img src="{data_address(p.image)}" width="{p.image.shape[1]}" height="{p.image.shape[0]}"'
             f' alt="{escape(p.text)}"><figcaption>{escape(p.title)}</figcaption></figure>'

@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.bounce import Sources
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.mesh import mean_edge_length
 from mvps.pbr import reflectance_scale, srgb_bytes
-from mvps.rendering import light_arriving, light_sources, photograph, points_under, shadow_at
+from mvps.rendering import light_arriving, photograph, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View
 from mvps.visibility import RayCaster
 
@@ -32,7 +33,7 @@ class Picture(NamedTuple):
     text: str
 
 
-def view_pictures(caster: RayCaster, reconstruction: Reconstruction, view: View) -> tuple[str, list[Picture]]:
+def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Reconstruction, view: View) -> tuple[str, list[Picture]]:
     """The light shown ("light 3") and the pictures of a view that the result holds."""
     place = reconstruction.views.index(view.name)
     shared = [k for k, number in enumerate(view.lights) if number in reconstruction.light_names[place]]
@@ -43,7 +44,7 @@ def view_pictures(caster: RayCaster, reconstruction: Reconstruction, view: View)
     direction, intensity = (values[place][row : row + 1] for values in (reconstruction.lights.direction, reconstruction.lights.intensity))
     material, offset = reconstruction.material, mean_edge_length(caster.surface)
     measured = view.radiance([chosen])[:, 0]
-    arriving = light_arriving(light_sources(caster.surface, material), material, direction)
+    arriving = light_arriving(sources, material, direction)
     rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset, arriving)[:, 0]
     dark = replace(material, albedo=np.zeros_like(material.albedo))
     specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity, offset)[:, 0]

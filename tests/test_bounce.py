@@ -1,0 +1,73 @@
+"""Inter-reflection: laws of light between surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from mvps.bounce import at, coarse_sources, gather, gathered
+from mvps.mesh import vertex_normals
+from mvps.scene import Surface
+
+
+def ball(radius: float = 10.0) -> Surface:
+    made = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    return Surface(np.array(made.vertices), np.array(made.faces))
+
+
+def hollow() -> Surface:
+    """The inside of a ball: faces turned inwards."""
+    outside = ball()
+    return Surface(outside.vertices, outside.faces[:, ::-1])
+
+
+def test_a_convex_body_sends_itself_nothing() -> None:
+    sources = coarse_sources(ball(), np.ones(2562))
+    assert sources.of.occupied.max() == 0
+    assert gathered(sources, np.array([[0, 0, 1.0]]), 1.0).max() == 0
+
+
+def test_inside_a_closed_surface_other_surfaces_fill_every_hemisphere() -> None:
+    # Rays start half an edge off the surface and may leave between facets only there.
+    assert np.abs(gather(hollow(), 3.0).occupied - 1).max() < 0.02
+
+
+def test_bounces_in_a_closed_white_furnace_add_up_to_the_geometric_series() -> None:
+    room = hollow()
+    sources = coarse_sources(room, np.full(len(room.vertices), 0.5))
+    # Any first light L, the same everywhere, gives S (L + r L + r^2 L) for three bounces with reflectance r = bounce * albedo.
+    L = np.ones(len(sources.albedo), np.float32)
+    expected = L + 0.4 * L + 0.16 * L
+    G = sources.of.S @ L
+    for _ in range(2):
+        G = sources.of.S @ (L + 0.4 * G)
+    assert np.abs(G - expected).max() < 0.05
+    assert gathered(sources, np.array([[0, 0, 1.0]]), 0.8).shape == (len(L), 1)
+
+
+def test_two_plates_that_face_each_other_light_each_other_by_their_view_factor() -> None:
+    """The middle of a square plate sees a parallel one of side 2 c at distance c with a view factor of 0.554 (Howell, B-3)."""
+    plates = []
+    for z in (-5.0, 5.0):
+        plate = trimesh.creation.box((20, 20, 0.1))
+        for _ in range(4):
+            plate = plate.subdivide()
+        plate.apply_translation([0, 0, z])
+        plates.append(plate)
+    both = trimesh.util.concatenate(plates)
+    of = gather(Surface(np.array(both.vertices), np.array(both.faces)), 2.0)
+    place = of.caster.surface.vertices[of.vertex]
+    inwards = (np.abs(place[:, :2]).max(1) < 1.5) & (of.normal[:, 2] * place[:, 2] < 0)
+    # Ten apart: a side of 20 is twice the distance.
+    assert inwards.sum() > 0 and abs(of.occupied[inwards].mean() - 0.554) < 0.05
+
+
+def test_colours_mix_channel_by_channel_and_interpolate_to_points() -> None:
+    room = hollow()
+    albedo = np.tile([0.2, 0.4, 0.8], (len(room.vertices), 1))
+    sources = coarse_sources(room, albedo)
+    G = gathered(sources, np.array([[0, 0, 1.0], [1.0, 0, 0]]), 0.0)
+    assert G.shape == (len(sources.albedo), 2, 3)
+    assert np.allclose(G[..., 1], 2 * G[..., 0], atol=1e-5) and np.allclose(G[..., 2], 4 * G[..., 0], atol=1e-5)
+    values = at(sources, G, room.vertices, vertex_normals(room))
+    assert values.shape == (len(room.vertices), 2, 3) and values.min() >= 0 and values.max() <= G.max() + 1e-6
