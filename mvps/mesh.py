@@ -71,20 +71,22 @@ def mass_matrix(surface: Surface) -> sp.csc_matrix:
 def edges(surface: Surface) -> Int:
     """(E, 2) undirected edges, the smaller index first, each once."""
     halves = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    unique: Int = np.unique(halves, axis=0)
-    return unique
+    n = len(surface.vertices)
+    # One number for two: numpy sorts numbers many times faster than rows.
+    key = np.unique(halves[:, 0] * n + halves[:, 1])
+    return np.stack([key // n, key % n], 1)
 
 
 def mean_edge_length(surface: Surface) -> float:
-    """Mean length of the edges."""
-    ends = surface.vertices[edges(surface)]
-    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1).mean())
+    """Mean length of the faces' sides: of the edges, those at a border counting half."""
+    corners = surface.vertices[surface.faces]
+    return float(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1).mean())
 
 
 def is_closed(surface: Surface) -> bool:
     """True where every edge has exactly two faces."""
     halves = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, count = np.unique(halves, axis=0, return_counts=True)
+    _, count = np.unique(halves[:, 0] * len(surface.vertices) + halves[:, 1], return_counts=True)
     return bool((count == 2).all())
 
 

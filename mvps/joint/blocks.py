@@ -37,11 +37,13 @@ WORKERS = 2
 
 @dataclass
 class Vertices:
-    """What is known about the vertices: normal (V, 3); reflectance (V, 1 + lobes) grey albedo and weights; scale (V,) of residuals."""
+    """What is known about the vertices: normal (V, 3); reflectance (V, 1 + lobes) grey albedo and weights; scale (V,) of residuals;
+    sigma (V,) standard deviation of the normal in radians as of the last step, infinite without samples, None before the first."""
 
     normal: Tensor
     reflectance: Tensor
     scale: Tensor
+    sigma: Tensor | None = None
 
 
 @dataclass(frozen=True)

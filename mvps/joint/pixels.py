@@ -85,7 +85,7 @@ def pixel_normals(
     albedo, certain = np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
     normals[hit] = normalise(state.normal.double().numpy())
     albedo[hit] = state.reflectance[:, :1].numpy() * _chroma(view, intensity, hit)
-    certain[hit] = confidence([samples], state, lights, material.law).numpy()
+    certain[hit] = confidence(state).numpy()
     return NormalMap(normals, albedo, certain)
 
 

@@ -39,7 +39,7 @@ POSITION_FLOOR_PIXELS = 0.1
 
 COST_SMOOTHINGS = 2
 FUSIONS = 2
-MATERIAL_STEPS = 3
+MATERIAL_STEPS, CARRIED_STEPS = 3, 2
 LIGHT_STEPS = 3
 WEAK_TIE = 0.3
 """Standard deviation, radians, of refined normals from the mesh's in the vertices' own steps: it only speaks where samples do not."""
@@ -204,7 +204,7 @@ def _photometric_round(
     vertices = _started(state, capture, mesh_normal, carried, device)
     before = vertices.normal
     lights = grey_lights(state.lights, device)
-    for _ in range(MATERIAL_STEPS):
+    for _ in range(MATERIAL_STEPS if carried is None else CARRIED_STEPS):
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     if state.coarse is None:
         state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
@@ -220,7 +220,7 @@ def _photometric_round(
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
     grey = vertices.reflectance[:, :1].double().cpu().numpy().repeat(3, axis=1)
-    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey, lights), state.lights, sources)
+    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey), state.lights, sources)
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (_angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     return {
@@ -319,12 +319,12 @@ def _finished(state: _State, capture: Capture, account: list[dict[str, float]], 
     grey = grey_lights(state.lights, device)
     albedo, ratios = colours(capture, state.surface, state.views, state.vertices, grey, state.law, ratios, state.lights.one_rig)
     lights = coloured_lights(grey, ratios, state.lights.one_rig)
-    material = _material(state, albedo, grey)
+    material = _material(state, albedo)
     status, text = _verdict(account)
     return Refined(state.surface, material, lights, state.maps, state.law, account, status, text)
 
 
-def _material(state: _State, albedo: Float, lights: list[DirectionalLights]) -> Material:
+def _material(state: _State, albedo: Float) -> Material:
     """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
     assert state.vertices is not None
     vertices, known = state.vertices, np.isfinite(albedo).all(1)
@@ -333,7 +333,7 @@ def _material(state: _State, albedo: Float, lights: list[DirectionalLights]) -> 
     normal = normalise(vertices.normal.double().cpu().numpy())
     normal[~known] = vertex_normals(state.surface)[~known]
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
-    certain = confidence(state.views, vertices, lights, state.law).double().cpu().numpy()
+    certain = confidence(vertices).double().cpu().numpy()
     return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.where(known, certain, 0), state.law.grazing, state.law.bounce)
 
 

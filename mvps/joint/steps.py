@@ -81,6 +81,7 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     equations = vertex_equations(views, vertices, lights, law)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
     vertices = replace(vertices, scale=scale.clamp_min(LEAST_SCALE * float(scale.median())))
+    sigma = _sigma(equations, vertices)
     add_ties(equations, vertices, anchor)
     lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
     step = bounded_step(equations.hessian, equations.gradient, lower)
@@ -88,17 +89,21 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     turn = turn * (LARGEST_TURN / turn.norm(dim=1, keepdim=True).clamp_min(LARGEST_TURN))
     first, second = tangents(vertices.normal)
     normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
-    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale)
+    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale, sigma)
 
 
-def confidence(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> Tensor:
-    """(V,) confidence in the normals: 1 / (1 + (sigma / RELIABLE)^2), sigma from the inverse of the normal equations.
+def _sigma(equations: NormalEquations, vertices: Vertices) -> Tensor:
+    """(V,) standard deviation of the normals, radians, from the inverse of the normal equations without ties.
 
     Residuals are the model's error rather than noise, and samples under neighbouring lights share it: CORRELATED of them count as one.
-    0 without samples.
     """
-    equations = vertex_equations(views, vertices, lights, law)
-    inverse = torch.linalg.inv(damped(equations.hessian, 1e-3).double())
+    inverse = torch.linalg.inv_ex(damped(equations.hessian, 1e-3).double())[0]
     variance = (inverse[:, 0, 0] + inverse[:, 1, 1]).clamp_min(0) / 2 * vertices.scale.double() ** 2 * CORRELATED
-    reliable: Tensor = 1 / (1 + variance / RELIABLE**2)
-    return torch.where(equations.count > 0, torch.nan_to_num(reliable), 0.0)
+    return torch.where(equations.count > 0, torch.nan_to_num(variance, nan=torch.inf).sqrt(), torch.inf)
+
+
+def confidence(vertices: Vertices) -> Tensor:
+    """(V,) confidence in the normals: 1 / (1 + (sigma / RELIABLE)^2); 0 without samples."""
+    assert vertices.sigma is not None
+    certain: Tensor = 1 / (1 + (vertices.sigma / RELIABLE) ** 2)
+    return certain
