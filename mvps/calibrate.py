@@ -31,7 +31,7 @@ from solvers.low_rank import Factorisation, factorise, robust_weights, solve_row
 MINIMUM_LIGHTS = 4
 """A rank-3 factorisation of three or fewer columns is exact for any data and so says nothing."""
 
-PIXELS_PER_VIEW = 2000
+PIXELS_PER_VIEW = 1000
 """Pixels drawn from a view: three unknowns a light against thousands of equations leave the error to the model, not to sampling."""
 
 SHADOWED = 0.1

@@ -66,7 +66,7 @@ class OccupancySettings:
     grid_rate, network_rate: Adam's; voxel: of the extracted surface
     """
 
-    steps: int = 400
+    steps: int = 250
     rays: int = 1024
     ring_rays: int = 512
     samples: int = 6

@@ -19,7 +19,7 @@ from mvps.camera import pixel_centres, rays
 from mvps.scene import Float, NormalMap, View
 from solvers.low_rank import robust_weights, solve_rows
 
-SWEEPS = 12
+SWEEPS = 4
 PIXELS_PER_CHUNK = 4096
 
 RELIABLE = 0.2

@@ -59,7 +59,7 @@ def second_pass(preset: str, free_lights: bool) -> RefineSettings:
 
     rounds = {
         "draft": (RoundSettings(1.5, 1.8, 0.3),),
-        "standard": (RoundSettings(1.5, 1.8, 0.3), RoundSettings(1.0, 1.2, 0.3, crease=0.2)),
+        "standard": (RoundSettings(1.5, 1.8, 0.3), RoundSettings(1.5, 1.2, 0.3, crease=0.1)),
         "fine": (
             RoundSettings(1.5, 1.8, 0.3),
             RoundSettings(1.0, 1.2, 0.3),
