@@ -35,6 +35,9 @@ mesh blurs; one view's lights hardly tell a lobe from a turned normal, so lobes 
 
 STEPS = 3
 
+OWN_LIGHTS = 4
+"""Lights of a view from which its pixels say something of their own: albedo and two angles of a normal are three unknowns."""
+
 
 def _samples(view: View, points: Points, shadow: Bool, intensity: Float, hit: Int) -> ViewSamples:
     image, usable = grey_radiance(view, intensity)
@@ -86,6 +89,9 @@ def pixel_normals(
     normals[hit] = normalise(state.normal.double().numpy())
     albedo[hit] = state.reflectance[:, :1].numpy() * _chroma(view, intensity, hit)
     certain[hit] = confidence(state).numpy()
+    if len(view.lights) < OWN_LIGHTS:
+        # What is known comes from the vertex, which other views saw under other lights.
+        certain[hit] = np.maximum(certain[hit], points.confidence[hit])
     return NormalMap(normals, albedo, certain)
 
 

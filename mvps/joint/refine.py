@@ -21,9 +21,9 @@ from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import face_targets, vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in, with_gathered
-from mvps.joint.pixels import all_pixel_normals
+from mvps.joint.pixels import OWN_LIGHTS, all_pixel_normals
 from mvps.joint.reflectance import colours
-from mvps.joint.steps import Anchor, confidence, free_reflectance, vertex_step, with_population
+from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, with_population
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.mesh import edges, isotropic_remesh, mean_edge_length, normalise, split_edges, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
@@ -145,10 +145,14 @@ def _started(
     seen = [(s.vertex.cpu().numpy(), s.weight.cpu().numpy()) for s in state.views]
     normal, albedo, total = vertex_maps(capture, state.surface, state.maps, seen)
     normal = np.where(total[:, None] > 0, normal, anchor)
+    # Under fewer than three lights a view's photometric stereo says nothing: albedo of Lambert's law under the mesh's normals.
+    lambert = lambert_albedo(state.views, _tensor(anchor, device), grey_lights(state.lights, device)).double().cpu().numpy()
+    albedo = np.where(total > 0, albedo, lambert)
+    level = float(np.median(albedo[albedo > 0])) if (albedo > 0).any() else 1.0
     reflectance = torch.zeros(len(normal), 1 + len(SHARPNESS), device=device)
     reflectance[:, 0] = _tensor(albedo, device)
     # No sample is an outlier before the first residuals are known.
-    return Vertices(_tensor(normal, device), reflectance, torch.full((len(normal),), float(np.median(albedo[total > 0])), device=device))
+    return Vertices(_tensor(normal, device), reflectance, torch.full((len(normal),), level, device=device))
 
 
 def _solve_lights(
@@ -250,7 +254,11 @@ def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
 
 def _moved(surface: Surface, otherwise: Float, state: _State, capture: Capture, seen: list[Any], reach: Float, pixel: float) -> Surface:
     """The surface moved to where views agree, with their normals. otherwise (V, 3): normals where no view sees; reach: offsets, pixels."""
-    agreed: Agreement = agreement(capture, surface, state.maps, seen, reach * pixel, COST_SMOOTHINGS)
+    if min(len(view.lights) for view in capture.views) < OWN_LIGHTS:
+        # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
+        agreed = Agreement(np.zeros(len(surface.vertices)), np.full(len(surface.vertices), pixel))
+    else:
+        agreed = agreement(capture, surface, state.maps, seen, reach * pixel, COST_SMOOTHINGS)
     # Faces turn and move, so that other pixels speak for them: twice.
     for _ in range(FUSIONS):
         outward = vertex_normals(surface)

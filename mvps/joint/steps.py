@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,6 +31,10 @@ CORRELATED = 6.0
 
 LEAST_SCALE = 0.1
 """Smallest scale of a vertex's residuals over the median one: a vertex with few samples may fit them exactly by chance."""
+
+
+LEAST_NOISE = 1e-3
+"""The same over the median albedo: no sensor is better than 10 bits. Where every vertex has too few samples, all fit exactly."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,17 @@ def with_population(views: list[ViewSamples], vertices: Vertices, lights: list[D
     return replace(anchor, reflectance=mean.to(like).expand_as(like), reflectance_sigma=sigma.to(like).expand_as(like))
 
 
+def lambert_albedo(views: list[ViewSamples], normal: Tensor, lights: list[DirectionalLights]) -> Tensor:
+    """(V,) least-squares albedo of Lambert's law for normals (V, 3); 0 without samples."""
+    top, bottom = torch.zeros_like(normal[:, 0]), torch.zeros_like(normal[:, 0])
+    for samples, of_view in zip(views, lights, strict=True):
+        q = (normal[samples.vertex] @ of_view.direction.T).clamp_min(0) * of_view.intensity
+        weight = samples.weight[:, None] * samples.data
+        top.index_add_(0, samples.vertex, (weight * q * samples.image).sum(1))
+        bottom.index_add_(0, samples.vertex, (weight * q * q).sum(1))
+    return torch.where(bottom > 0, top / bottom.clamp_min(torch.finfo(top.dtype).tiny), 0.0)
+
+
 def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> None:
     """Adds the ties to the normal equations, in place."""
     unit = equations.count * vertices.scale**2
@@ -80,7 +96,7 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
     equations = vertex_equations(views, vertices, lights, law)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
-    vertices = replace(vertices, scale=scale.clamp_min(LEAST_SCALE * float(scale.median())))
+    vertices = replace(vertices, scale=scale.clamp_min(_least_scale(scale[equations.count > 0], vertices.reflectance[:, 0])))
     sigma = _sigma(equations, vertices)
     add_ties(equations, vertices, anchor)
     lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
@@ -90,6 +106,12 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     first, second = tangents(vertices.normal)
     normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
     return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale, sigma)
+
+
+def _least_scale(scale: Tensor, albedo: Tensor) -> float:
+    """The smallest scale that is believed, for the scales of vertices with samples (n,) and albedo (V,)."""
+    middle = float(scale.median()) if len(scale) else 0.0
+    return max(LEAST_SCALE * middle, LEAST_NOISE * float(albedo.median()), float(np.finfo(np.float32).tiny))
 
 
 def _sigma(equations: NormalEquations, vertices: Vertices) -> Tensor:
