@@ -67,7 +67,7 @@ def second_pass(preset: str, free_lights: bool) -> RefineSettings:
             RoundSettings(0.8, 0.6, 0.2, crease=0.1),
         ),
     }[preset]
-    return RefineSettings(rounds, free_lights=free_lights)
+    return RefineSettings(rounds, free_lights=free_lights, choose=True)
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
@@ -241,6 +241,12 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
         complete = all_lights(capture, used, held, refined)
         pictures = normal_pictures(capture, used, refined)
     metrics = {"stages": progress.stages, "rounds": rough.rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
+    metrics["model"] = {
+        "components": [asdict(trial) for trial in refined.trials],
+        "sharpness": list(refined.law.sharpness),
+        "grazing": refined.law.grazing,
+        "bounce": refined.law.bounce,
+    }
     return Reconstruction(
         refined.surface,
         refined.material,

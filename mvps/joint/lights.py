@@ -118,7 +118,7 @@ def _coupled(
     return lights_hessian, lights_gradient, hessian, gradient, cross, samples_of
 
 
-def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, free_lights: bool) -> Tensor:
+def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, solved: tuple[bool, bool, bool]) -> Tensor:
     """dm of the Schur complement."""
     H, g, hessian, gradient, cross, samples_of = parts
     away = vertices.normal - anchor.normal
@@ -142,9 +142,10 @@ def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor,
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
     diagonal = torch.diagonal(H).clamp_min(0)
     H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max())
-    first = 0 if free_lights else len(g) - OF_LAW
+    wanted = torch.cat([torch.full((len(g) - OF_LAW,), solved[0]), torch.tensor(solved[1:])]).nonzero()[:, 0].to(g.device)
     step = torch.zeros_like(g)
-    step[first:] = -torch.linalg.solve(H[first:, first:], g[first:])
+    if len(wanted):
+        step[wanted] = -torch.linalg.solve(H[wanted][:, wanted], g[wanted])
     return step
 
 
@@ -156,15 +157,15 @@ def light_step(
     anchor: Anchor,
     rotations: list[Tensor],
     one_rig: bool,
-    free_lights: bool = True,
+    free: tuple[bool, bool, bool] = (True, True, True),
 ) -> tuple[list[DirectionalLights], Law]:
-    """One Gauss-Newton step of all lights (unless not free_lights), grazing and bounce with the vertices eliminated.
+    """One Gauss-Newton step of what is free of lights, grazing and bounce, with the vertices eliminated.
 
     rotations: camera_from_world of the views, float32.
     """
     layout = _layout(lights, one_rig)
     parts = _coupled(views, vertices, lights, law, rotations, layout)
-    step = _reduced_step(parts, vertices, anchor, free_lights)
+    step = _reduced_step(parts, vertices, anchor, free)
     stepped = []
     for of_view, rotation, start in zip(lights, rotations, layout.start, strict=True):
         m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.bounce import PATCH_EDGES, Gather, gather, sources_on
+from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
 from mvps.camera import pixel_footprint
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import face_targets, vertex_maps
@@ -24,7 +24,9 @@ from mvps.joint.observe import ViewSamples, channel_ratio, observe, visible_in, 
 from mvps.joint.pixels import OWN_LIGHTS, all_pixel_normals
 from mvps.joint.reflectance import colours
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, with_population
+from mvps.joint.trial import held_out_errors
 from mvps.joint.vertices import Agreement, agreement, fuse
+from mvps.material import Model, Trial, candidates, choose
 from mvps.mesh import edges, isotropic_remesh, mean_edge_length, normalise, split_edges, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
@@ -39,6 +41,7 @@ POSITION_FLOOR_PIXELS = 0.1
 
 COST_SMOOTHINGS = 2
 FUSIONS = 2
+TRIAL_VERTICES = 1000
 MATERIAL_STEPS, CARRIED_STEPS = 3, 2
 LIGHT_STEPS = 3
 WEAK_TIE = 0.3
@@ -75,11 +78,13 @@ class RoundSettings:
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """rounds: in order; light_vertices: vertices that stand for all when the lights are solved; free_lights: solve the lights."""
+    """rounds: in order; light_vertices: vertices that stand for all when the lights are solved; free_lights: solve the lights; choose: the
+    components of the reflectance model by held-out lights, in the first round."""
 
     rounds: tuple[RoundSettings, ...]
     light_vertices: int = 2000
     free_lights: bool = True
+    choose: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +96,7 @@ class Refined:
     lights: Lights
     maps: tuple[NormalMap, ...]
     law: Law
+    trials: list[Trial]
     rounds: list[dict[str, float]]
     status: str
     text: str
@@ -107,6 +113,8 @@ class _State:
     vertices: Vertices | None = None
     coarse: Gather | None = None
     views: list[ViewSamples] = field(default_factory=list)
+    model: Model = field(default_factory=lambda: Model(SHARPNESS, True, True))
+    trials: list[Trial] = field(default_factory=list)
 
 
 def chosen_device(device: str) -> str:
@@ -149,10 +157,31 @@ def _started(
     lambert = lambert_albedo(state.views, _tensor(anchor, device), grey_lights(state.lights, device)).double().cpu().numpy()
     albedo = np.where(total > 0, albedo, lambert)
     level = float(np.median(albedo[albedo > 0])) if (albedo > 0).any() else 1.0
-    reflectance = torch.zeros(len(normal), 1 + len(SHARPNESS), device=device)
+    reflectance = torch.zeros(len(normal), 1 + len(state.law.sharpness), device=device)
     reflectance[:, 0] = _tensor(albedo, device)
     # No sample is an outlier before the first residuals are known.
     return Vertices(_tensor(normal, device), reflectance, torch.full((len(normal),), level, device=device))
+
+
+def _some(
+    views: list[ViewSamples], vertices: Vertices, anchor: Anchor, count: int, generator: np.random.Generator
+) -> tuple[list[ViewSamples], Vertices, Anchor]:
+    """The problem on a random part of the vertices that are seen."""
+    seen = torch.cat([samples.vertex for samples in views]).unique()
+    order = generator.permutation(len(seen))[:count]
+    return subset(views, vertices, anchor, seen[torch.from_numpy(np.sort(order)).to(seen.device)])
+
+
+def _choose_model(
+    state: _State, capture: Capture, start: Vertices, anchor: Anchor, generator: np.random.Generator, device: torch.device
+) -> None:
+    """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account."""
+    few, part, tie = _some(state.views, start, anchor, TRIAL_VERTICES, generator)
+    rotations = [_tensor(view.camera.rotation, device) for view in capture.views]
+    lights = grey_lights(state.lights, device)
+    state.model, state.trials = choose(candidates(SHARPNESS), lambda model: held_out_errors(few, part, lights, tie, rotations, model))
+    law = state.law
+    state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
 
 
 def _solve_lights(
@@ -165,16 +194,12 @@ def _solve_lights(
     device: torch.device,
 ) -> Lights:
     """The lights solved on a random part of the vertices, which are solved along."""
-    seen = torch.zeros(len(vertices.normal), dtype=torch.bool, device=device)
-    for samples in state.views:
-        seen[samples.vertex] = True
-    candidates = torch.nonzero(seen)[:, 0].cpu().numpy()
-    chosen = np.sort(generator.permutation(candidates)[: settings.light_vertices])
-    few, part, tie = subset(state.views, vertices, anchor, torch.from_numpy(chosen).to(device))
+    few, part, tie = _some(state.views, vertices, anchor, settings.light_vertices, generator)
     rotations = [_tensor(view.camera.rotation, device) for view in capture.views]
     lights = grey_lights(state.lights, device)
+    free = (settings.free_lights, state.model.grazing, state.model.bounce)
     for _ in range(LIGHT_STEPS):
-        lights, state.law = light_step(few, part, lights, state.law, tie, rotations, state.lights.one_rig, settings.free_lights)
+        lights, state.law = light_step(few, part, lights, state.law, tie, rotations, state.lights.one_rig, free)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie)
@@ -193,6 +218,19 @@ def light_change(a: Lights, b: Lights) -> tuple[float, float]:
     return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
 
 
+def _sources(state: _State, vertices: Vertices) -> Sources | None:
+    """The patches that send light, with the vertices' albedo; None where inter-reflection is not modelled."""
+    if state.coarse is None or not state.model.bounce:
+        return None
+    return sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
+
+
+def _gathered(state: _State, vertices: Vertices) -> list[ViewSamples]:
+    """The samples with what other surfaces send to them."""
+    sources = _sources(state, vertices)
+    return state.views if sources is None else with_gathered(state.views, state.surface, sources, state.law.bounce, state.lights)
+
+
 def _photometric_round(
     state: _State,
     capture: Capture,
@@ -204,16 +242,21 @@ def _photometric_round(
     """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
     state.views = observe(capture, state.surface, state.lights, device)
     mesh_normal = vertex_normals(state.surface)
-    free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(SHARPNESS))
     vertices = _started(state, capture, mesh_normal, carried, device)
-    before = vertices.normal
     lights = grey_lights(state.lights, device)
-    for _ in range(MATERIAL_STEPS if carried is None else CARRIED_STEPS):
-        vertices = vertex_step(state.views, vertices, lights, state.law, free)
     if state.coarse is None:
         state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
-    sources = sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
-    state.views = with_gathered(state.views, state.surface, sources, state.law.bounce, state.lights)
+    if settings.choose and not state.trials:
+        tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
+        state.views = _gathered(state, vertices)
+        _choose_model(state, capture, vertices, tie, generator, device)
+        vertices = replace(vertices, reflectance=vertices.reflectance[:, : 1 + len(state.law.sharpness)])
+    free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
+    before = vertices.normal
+    for _ in range(MATERIAL_STEPS if carried is None else CARRIED_STEPS):
+        vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    if state.model.bounce:
+        state.views = _gathered(state, vertices)
     free = with_population(state.views, vertices, lights, state.law, free)
     solved = _solve_lights(state, vertices, replace(free, sigma=LIGHT_TIE), capture, settings, generator, device)
     moved = light_change(state.lights, solved)
@@ -224,7 +267,7 @@ def _photometric_round(
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
     grey = vertices.reflectance[:, :1].double().cpu().numpy().repeat(3, axis=1)
-    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey), state.lights, sources)
+    state.maps = all_pixel_normals(capture, state.surface, _material(state, grey), state.lights, _sources(state, vertices))
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (_angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     return {
@@ -329,7 +372,7 @@ def _finished(state: _State, capture: Capture, account: list[dict[str, float]], 
     lights = coloured_lights(grey, ratios, state.lights.one_rig)
     material = _material(state, albedo)
     status, text = _verdict(account)
-    return Refined(state.surface, material, lights, state.maps, state.law, account, status, text)
+    return Refined(state.surface, material, lights, state.maps, state.law, state.trials, account, status, text)
 
 
 def _material(state: _State, albedo: Float) -> Material:
@@ -342,7 +385,8 @@ def _material(state: _State, albedo: Float) -> Material:
     normal[~known] = vertex_normals(state.surface)[~known]
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
     certain = confidence(vertices).double().cpu().numpy()
-    return Material(normal, albedo[nearest], weight, np.array(SHARPNESS), np.where(known, certain, 0), state.law.grazing, state.law.bounce)
+    certain, law = np.where(known, certain, 0), state.law
+    return Material(normal, albedo[nearest], weight, np.array(law.sharpness), certain, law.grazing, law.bounce)
 
 
 def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:

@@ -186,8 +186,11 @@ def _rounds(rounds: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _components(components: Sequence[Mapping[str, Any]]) -> str:
-    names = {"name": "component", "kept": "kept", "gain": "gain", "seconds": "time, s", "why": "why"}
-    return _section("Reflectance model", _columns(components, names)) if components else ""
+    names = {"name": "component", "kept": "kept", "gain": "gain", "noise": "its standard error", "seconds": "time, s", "why": "why"}
+    if not components:
+        return ""
+    said = "<p>A component stays if it lowers the error on held-out lights (gain, as a share of it) by more than three standard errors.</p>"
+    return _section("Reflectance model", said + _columns(components, names))
 
 
 def _truth(truth: Mapping[str, Any]) -> str:

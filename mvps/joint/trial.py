@@ -1,0 +1,64 @@
+"""Errors on held-out samples of the joint problem, for the choice of the reflectance model (material.py).
+
+Of every view each HELD_OUT_EVERY-th light is kept back, other ones in the next view. The rest fits normals and reflectance of some
+vertices and what the law has free, lights fixed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
+from mvps.joint.lights import light_step
+from mvps.joint.observe import ViewSamples
+from mvps.joint.steps import Anchor, vertex_step
+from mvps.material import Model
+from mvps.scene import Float, Law
+
+HELD_OUT_EVERY = 5
+VERTEX_STEPS, LAW_STEPS = 3, 2
+
+
+def _parted(views: list[ViewSamples]) -> tuple[list[ViewSamples], list[ViewSamples]]:
+    """The samples to fit and those kept back."""
+    fitted, kept = [], []
+    for i, samples in enumerate(views):
+        back = (torch.arange(samples.image.shape[1], device=samples.image.device) + i) % HELD_OUT_EVERY == 0
+        fitted.append(replace(samples, data=samples.data & ~back))
+        kept.append(replace(samples, data=samples.data & back))
+    return fitted, kept
+
+
+def held_out_errors(
+    views: list[ViewSamples], start: Vertices, lights: list[DirectionalLights], anchor: Anchor, rotations: list[Tensor], model: Model
+) -> Float:
+    """(V,) mean absolute error of the held-out samples over their mean value, NaN for a vertex without any.
+
+    start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals.
+    """
+    fitted, kept = _parted(views)
+    unknowns = 1 + len(model.sharpness)
+    reflectance = torch.cat([start.reflectance[:, :1], start.reflectance.new_zeros(len(start.normal), unknowns - 1)], 1)
+    state = Vertices(start.normal, reflectance, start.scale)
+    free = replace(anchor, reflectance=torch.zeros_like(reflectance), reflectance_sigma=torch.full_like(reflectance, torch.inf))
+    law = Law(model.sharpness)
+    for _ in range(VERTEX_STEPS):
+        state = vertex_step(fitted, state, lights, law, free)
+    for _ in range(LAW_STEPS if model.grazing or model.bounce else 0):
+        _, law = light_step(fitted, state, lights, law, free, rotations, False, (False, model.grazing, model.bounce))
+        for _ in range(2):
+            state = vertex_step(fitted, state, lights, law, free)
+    error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)
+    for samples, of_view in zip(kept, lights, strict=True):
+        for part in samples.chunks():
+            index = samples.vertex[part]
+            shaded = evaluate(state.normal[index], state.reflectance[index], samples.towards[part], of_view, law, samples.gathered_of(part))
+            weight = samples.weight[part, None] * samples.data[part]
+            error.index_add_(0, index, (weight * (shaded.predicted - samples.image[part]).abs()).sum(1))
+            level.index_add_(0, index, (weight * samples.image[part]).sum(1))
+    ratio = (error / level).double().cpu().numpy()
+    return np.where(level.cpu().numpy() > 0, ratio, np.nan)
