@@ -1,8 +1,8 @@
 """Figures per capture: reconstruct through the command line, evaluate, and keep a table.
 
-    python benchmarks/accuracy.py CAPTURES [bunny armadillo spot buddha] [--preset standard]
+    python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard]
 
-CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file: errors against
+CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file: errors against
 ground truth (which the reconstruction never reads), seconds of the whole command, and its peak memory, with the machine named.
 """
 
@@ -21,6 +21,18 @@ from typing import Any
 
 HERE = Path(__file__).resolve().parent
 
+CASES: dict[str, tuple[str, list[str]]] = {
+    "bunny": ("bunny", []),
+    "armadillo": ("armadillo", []),
+    "spot": ("spot", []),
+    "buddha": ("buddha", []),
+    "bunny-5-views": ("bunny", ["--views", "1,5,9,13,17"]),
+    "bunny-4-lights": ("bunny", ["--lights", "1,11,21,32"]),
+    "bunny-1-light-a-view": ("bunny", ["--lights", "ONE_LIGHT"]),
+    "bunny-held-out-views": ("bunny", ["--hold-out-views", "4,8,12,16,20"]),
+}
+"""Name: capture and options of mvps.reconstruct. ONE_LIGHT stands for a file that gives view k light 1 + 7 k mod 32."""
+
 COLUMNS = (
     ("light deg", "light_error_deg", 1, 2),
     ("intensity %", "intensity_error", 100, 2),
@@ -30,6 +42,7 @@ COLUMNS = (
     ("Chamfer mm", "chamfer_mm", 1, 3),
     ("signed offset px", "offset_px", 1, 3),
     ("F@0.5 mm", "f_score_0_5_mm", 1, 3),
+    ("held-out PSNR dB", "held_out_views_psnr_db", 1, 1),
     ("s", "seconds", 1, 0),
     ("peak MB", "peak_memory_mb", 1, 0),
 )
@@ -42,11 +55,15 @@ def machine() -> str:
     return f"{model or platform.processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
 
 
-def measure(capture: Path, preset: str, folder: Path) -> dict[str, Any]:
-    """One row: the figures of one capture."""
-    result, figures = folder / capture.name, folder / f"{capture.name}.json"
+def measure(name: str, captures: Path, preset: str, folder: Path) -> dict[str, Any]:
+    """One row: the figures of one case."""
+    capture, options = captures / CASES[name][0], CASES[name][1]
+    one_light = folder / "one-light.json"
+    one_light.write_text(json.dumps({f"view_{k:02d}": [1 + 7 * k % 32] for k in range(1, 21)}), encoding="utf-8")
+    options = [str(one_light) if option == "ONE_LIGHT" else option for option in options]
+    result, figures = folder / name, folder / f"{name}.json"
     start = time.perf_counter()
-    command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet"]
+    command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet", *options]
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
     seconds = time.perf_counter() - start
     command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture), "--json", str(figures)]
@@ -54,22 +71,23 @@ def measure(capture: Path, preset: str, folder: Path) -> dict[str, Any]:
     metrics = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
     stages = metrics["stages"]
     return {
-        "capture": capture.name,
+        "case": name,
         **metrics["truth"],
         "seconds": seconds,
         "peak_memory_mb": max(stage["peak_memory_mb"] for stage in stages),
         "status": metrics["status"]["name"],
         "stages": {stage["name"]: stage["seconds"] for stage in stages},
+        "components": {c["name"]: [c["kept"], c["gain"], c["noise"], c["seconds"]] for c in metrics["model"]["components"]},
     }
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rows as Markdown."""
-    titles = ["capture", *(title for title, *_ in COLUMNS), "status"]
+    titles = ["case", *(title for title, *_ in COLUMNS), "status"]
     lines = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
     for row in rows:
         figures = [f"{factor * row[key]:.{digits}f}" if key in row else "-" for _, key, factor, digits in COLUMNS]
-        lines.append("| " + " | ".join([row["capture"], *figures, row["status"]]) + " |")
+        lines.append("| " + " | ".join([row["case"], *figures, row["status"]]) + " |")
     return "\n".join(lines)
 
 
@@ -77,11 +95,11 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path)
-    parser.add_argument("names", nargs="*", default=["bunny", "armadillo", "spot", "buddha"])
+    parser.add_argument("cases", nargs="*", help=" ".join(CASES))
     parser.add_argument("--preset", default="standard")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = [measure(given.captures / name, given.preset, Path(folder)) for name in given.names]
+        rows = [measure(name, given.captures, given.preset, Path(folder)) for name in given.cases or CASES]
     stem = HERE / f"accuracy-{given.preset}"
     record = {"machine": machine(), "preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
