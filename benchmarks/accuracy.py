@@ -2,8 +2,9 @@
 
     python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard]
 
-CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file: errors against
-ground truth (which the reconstruction never reads), seconds of the whole command, and its peak memory, with the machine named.
+CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and
+accuracy-PRESET.md beside this file: errors against ground truth (which the reconstruction never reads), seconds of the whole command, and
+its peak memory, with the machine named.
 """
 
 from __future__ import annotations

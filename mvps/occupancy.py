@@ -60,7 +60,8 @@ class OccupancySettings:
 
     steps, rays, ring_rays: Adam steps and rays in each; samples, ring_samples: per ray
     finest, levels, features: spacing of the finest grid, grids (each twice as coarse as the next), features on a node
-    hidden: units of the network; band, width: of the sampling interval (+-) and of the occupancy's edge, at first as wide as the hull of few views bulges; step: of finite differences
+    hidden: units of the network; band, width: of the sampling interval (+-) and of the occupancy's edge, at first as wide as the hull of
+    few views bulges; step: of finite differences
     ring: half-width in pixels of the ring around the silhouette; normal, colour, mask, smooth: weights of the losses
     outlier: |difference| of unit normals or relative colours at which a pixel counts as an outlier
     grid_rate, network_rate: Adam's; voxel: of the extracted surface

@@ -1,0 +1,71 @@
+"""The choice of the reflectance model: what helps stays, what does not goes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sphere_scene import SphereScene, make_sphere
+
+from mvps.joint.blocks import Vertices
+from mvps.joint.observe import observe
+from mvps.joint.refine import grey_lights
+from mvps.joint.steps import free_reflectance
+from mvps.joint.trial import held_out_errors
+from mvps.material import Model, candidates, choose
+
+CPU = torch.device("cpu")
+
+
+def errors(level: float) -> np.ndarray:
+    """Errors with long tails, alike from call to call but for their level and a little noise."""
+    tails = np.random.default_rng(0).lognormal(0, 1.5, 500)
+    return level * tails * np.random.default_rng(int(1e6 * level)).lognormal(0, 0.1, 500)
+
+
+def test_a_component_that_helps_stays_and_one_that_does_not_goes() -> None:
+    def held_out(model: Model) -> np.ndarray:
+        return errors(1.0 - 0.2 * (30.0 in model.sharpness) + 0.001 * model.bounce)
+
+    model, trials = choose(candidates((8.0, 30.0)), held_out)
+    assert model == Model((30.0,))
+    assert [trial.kept for trial in trials] == [False, True, False, False]
+    assert trials[1].gain == pytest.approx(-np.log(0.8), abs=0.02) and trials[1].noise < 0.02
+
+
+def test_vertices_without_held_out_samples_do_not_count() -> None:
+    def held_out(model: Model) -> np.ndarray:
+        values = errors(1.0 - 0.2 * model.grazing)
+        values[::2] = np.nan
+        return values
+
+    assert choose(candidates(()), held_out)[0] == Model((), True, False)
+    assert choose(candidates(()), lambda _: np.full(3, np.nan))[0] == Model()
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    return make_sphere(subdivisions=4)
+
+
+@pytest.mark.parametrize("glossy", [True, False])
+def test_lobes_are_kept_on_a_glossy_ball_alone(scene: SphereScene, glossy: bool) -> None:
+    r = scene.reconstruction
+    views = observe(scene.capture, r.surface, r.lights, CPU)
+    lights = grey_lights(r.lights, CPU)
+    normal = torch.tensor(r.material.normal, dtype=torch.float32)
+    albedo = torch.tensor(r.material.albedo.mean(1, keepdims=True), dtype=torch.float32)
+    if not glossy:
+        # The same ball in Lambert's paint, with one per cent of noise.
+        noise = torch.Generator().manual_seed(0)
+        for k, (samples, of_view) in enumerate(zip(views, lights, strict=True)):
+            image = albedo[samples.vertex] * (normal[samples.vertex] @ of_view.direction.T).clamp_min(0) * of_view.intensity
+            views[k] = replace(samples, image=image * (1 + 0.01 * torch.randn(image.shape, generator=noise)))
+    start = Vertices(normal, albedo, albedo[:, 0].clone())
+    tie = free_reflectance(normal, 0.05, 1)
+    rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
+    lobes = candidates((12.0, 60.0))[:2]
+    model, _ = choose(lobes, lambda m: held_out_errors(views, start, lights, tie, rotations, m))
+    assert (len(model.sharpness) > 0) == glossy
