@@ -13,6 +13,7 @@ import scipy.io
 from mvps import evaluate, reconstruct
 from mvps.command import run
 from mvps.export import read_reconstruction
+from mvps.measures import distance_to
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -97,11 +98,11 @@ def test_the_frame_and_the_unit_of_the_world_do_not_matter(
 ) -> None:
     elsewhere = reconstructed(moved(capture, tmp_path / "capture", rotation, shift, unit), tmp_path / "result")
     here, there = read_reconstruction(result), read_reconstruction(elsewhere)
+    # Grids lie along other axes, so meshes differ in their vertices but not in what they show; what no view saw has no figure.
     back = (there.surface.vertices / unit - shift) @ rotation
-    span = np.ptp(here.surface.vertices, axis=0)
-    # Grids lie along other axes, so meshes differ in their vertices but not in what they show.
-    assert np.abs(back.min(0) - here.surface.vertices.min(0)).max() < 0.01 * span.max()
-    assert np.abs(np.ptp(back, axis=0) - span).max() < 0.01 * span.max()
+    apart, _ = distance_to(back[there.material.confidence > 0.5], here.surface)
+    span = np.ptp(here.surface.vertices, axis=0).max()
+    assert np.median(apart) < 0.001 * span and np.quantile(apart, 0.99) < 0.01 * span
     for a, b in zip(here.lights.direction, there.lights.direction, strict=True):
         assert np.degrees(np.arccos(np.clip((a * (b @ rotation)).sum(1), -1, 1))).max() < 0.6
     difference = [(a * (b @ rotation)).sum(-1) for a, b in zip(here.normal_maps, there.normal_maps, strict=True)]
