@@ -51,9 +51,9 @@ def solve_rows(M: NDArray[Any], W: NDArray[Any], Y: NDArray[Any], ridge: float =
 def robust_weights(residual: NDArray[Any], known: NDArray[Any], floor: float) -> NDArray[np.float64]:
     """Cauchy weights of residuals (m, n), scale per row from its known entries; `floor` is the smallest scale (noise)."""
     absolute = np.where(known > 0, np.abs(residual), np.nan)
-    with np.errstate(all="ignore"):
-        scale = np.nanmedian(absolute, axis=1, keepdims=True) * MAD_TO_SIGMA
-    scale = np.maximum(np.nan_to_num(scale, nan=1.0), floor)
+    # A row without entries has no scale and needs none; a median of nothing would warn.
+    absolute[~(known > 0).any(1)] = 1.0
+    scale = np.maximum(np.nanmedian(absolute, axis=1, keepdims=True) * MAD_TO_SIGMA, max(floor, np.finfo(np.float64).tiny))
     weights: NDArray[np.float64] = known / (1 + (residual / (CAUCHY_95 * scale)) ** 2)
     return weights
 
