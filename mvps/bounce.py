@@ -46,12 +46,6 @@ class Gather:
     S: sp.csr_matrix
     tree: cKDTree
 
-    @property
-    def occupied(self) -> Float:
-        """(n,) share of the cosine-weighted hemisphere that other surfaces take up."""
-        share: Float = np.asarray(self.S.sum(1))[:, 0]
-        return share
-
 
 def gather(surface: Surface, size: float) -> Gather:
     """Patches of about `size`, and S between them. A patch is the vertices in a cube whose normals lie in one octant, so that thin parts

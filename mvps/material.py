@@ -19,7 +19,7 @@ import numpy as np
 from mvps.scene import Float
 
 CERTAIN = 3.0
-"""Standard errors that a gain must exceed: among half a dozen trials one in a hundred would pass by chance at less."""
+"""Standard errors that a gain must exceed: fewer than one in a hundred runs of half a dozen trials then keeps a component by chance."""
 
 
 @dataclass(frozen=True)

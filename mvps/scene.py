@@ -235,8 +235,8 @@ class Surface:
 
 
 GRAZING_POWER = 3
-"""Of (1 - cosine) in the diffuse term's grazing factor (shading.py): measured matte and glossy paints change by a third of their change at
-90 degrees when a light stands at 60, by a tenth at 45, between the powers 2 of rough and 5 of smooth dielectrics."""
+"""Of (1 - cosine) in the diffuse term's grazing factor (shading.py). Measured falloffs of two materials ask for 3 and 4 (docs/method.md);
+Schlick's dielectrics have 5."""
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ from mvps.scene import Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, cast_shadow, visible_vertices
 
 SAMPLES_PER_CHUNK = 1 << 17
-"""Samples handled at once: the dozen arrays of a chunk, half a megabyte each, stay in a processor's last cache, and the interpreter's
-time for an operation, some microseconds, stays below a tenth of the operation's own (measured: docs/method.md)."""
+"""Samples handled at once: smaller chunks wait for the interpreter, larger ones leave the processor's last cache (docs/method.md)."""
 
 
 LIGHTEST_PAIR = 1e-3
