@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from mvps import measures
-from mvps.joint.refine import SHARPNESS, RefineSettings, RoundSettings, refine
+from mvps.joint.photometry import SHARPNESS
+from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.load import read_capture, read_truth
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, first_lights, first_pass, photometric_stereo, rough_shape, stage_one, stage_two

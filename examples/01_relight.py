@@ -11,7 +11,6 @@ import numpy as np
 
 from mvps.export import read_reconstruction
 from mvps.load import read_capture
-from mvps.mesh import mean_edge_length
 from mvps.rendering import photograph, points_under
 from mvps.visibility import RayCaster
 
@@ -32,8 +31,7 @@ def main(result: str, capture: str, out: str) -> None:
 
     # A light from the upper right, halfway to the camera. Camera axes: x right, y down, z forward.
     light = np.array([[1.0, -1.0, -1.0]]) / np.sqrt(3) @ view.camera.rotation
-    offset = mean_edge_length(reconstruction.surface)
-    relit = photograph(caster, reconstruction.material, view.camera, view.pixels, light, np.ones((1, 3)), offset)[:, 0]
+    relit = photograph(caster, reconstruction.material, view.camera, view.pixels, light, np.ones((1, 3)))[:, 0]
     brightest = np.quantile(relit, 0.99)
 
     photo = view.radiance()[:, 0]

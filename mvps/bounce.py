@@ -111,7 +111,7 @@ def _around(normal: Float, directions: Float) -> Float:
 def gathered(sources: Sources, direction: Float, bounce: float) -> NDArray[np.float32]:
     """G (n, lights) or (n, lights, channels) on the patches under lights direction (lights, 3)."""
     of = sources.of
-    shadow = cast_shadow(of.caster, of.vertex, of.caster.vertex_normals, direction, mean_edge_length(of.caster.surface))
+    shadow = cast_shadow(of.caster, of.vertex, direction)
     lit = (np.maximum(of.normal @ direction.T, 0) * ~shadow).astype(np.float32)
 
     def of_channel(albedo: Float) -> NDArray[np.float32]:

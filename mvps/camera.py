@@ -38,7 +38,7 @@ def rays(camera: Camera, image: Float) -> tuple[Float, Float]:
     """Origins (..., 3) (the camera's centre) and unit directions (..., 3) in the world, through image coordinates (..., 2)."""
     homogeneous = np.concatenate([image, np.ones_like(image[..., :1])], -1)
     direction = homogeneous @ np.linalg.inv(camera.K).T @ camera.rotation
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    direction /= np.sqrt(np.einsum("...i,...i->...", direction, direction))[..., None]
     return np.broadcast_to(camera.centre, direction.shape).copy(), direction
 
 
@@ -51,7 +51,7 @@ def pixel_centres(pixels: Int) -> Float:
 def view_directions(camera: Camera, points: Float) -> Float:
     """Unit vectors (..., 3), world frame, from points towards the camera."""
     towards = camera.centre - points
-    unit: Float = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    unit: Float = towards / np.sqrt(np.einsum("...i,...i->...", towards, towards))[..., None]
     return unit
 
 

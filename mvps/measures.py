@@ -22,7 +22,7 @@ import igl
 import numpy as np
 
 from mvps.camera import pixel_footprint
-from mvps.mesh import mean_edge_length, normalise, vertex_normals
+from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
 
@@ -199,14 +199,14 @@ def photograph_errors(
     """
     from mvps.rendering import light_arriving, light_sources, photograph
 
-    caster, offset, sources = RayCaster(surface), mean_edge_length(surface), light_sources(surface, material)
+    caster, sources = RayCaster(surface), light_sources(surface, material)
     pairs: list[tuple[View, Any, Any, Any]] = []
     for view in capture.views:
         kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]
         if kept:
             direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
             arriving = light_arriving(sources, material, direction)
-            rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset, arriving)
+            rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)
             pairs.append((view, rendered, view.radiance(kept), view.usable(kept)))
     if not pairs:
         return {}

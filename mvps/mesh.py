@@ -25,8 +25,14 @@ def face_cross(surface: Surface) -> Float:
 
 def normalise(vectors: Float, floor: float = 1e-300) -> Float:
     """Vectors (..., 3) divided by their length; a zero vector stays zero."""
-    unit: Float = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), floor)
+    unit: Float = vectors / np.maximum(lengths(vectors), floor)[..., None]
     return unit
+
+
+def lengths(vectors: Float) -> Float:
+    """(...,) lengths of vectors (..., 3); several times faster than numpy's norm, which reduces three numbers at a time."""
+    length: Float = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
+    return length
 
 
 def face_normals(surface: Surface) -> Float:
@@ -36,7 +42,7 @@ def face_normals(surface: Surface) -> Float:
 
 def face_areas(surface: Surface) -> Float:
     """(F,) areas."""
-    areas: Float = np.linalg.norm(face_cross(surface), axis=-1) / 2
+    areas: Float = lengths(face_cross(surface)) / 2
     return areas
 
 
@@ -48,7 +54,7 @@ def vertex_normals(surface: Surface) -> Float:
     for k in range(3):
         u = normalise(corners[:, (k + 1) % 3] - corners[:, k])
         v = normalise(corners[:, (k + 2) % 3] - corners[:, k])
-        angle = np.arccos(np.clip((u * v).sum(-1), -1, 1))
+        angle = np.arccos(np.clip(np.einsum("fi,fi->f", u, v), -1, 1))
         for axis in range(3):
             total[:, axis] += np.bincount(surface.faces[:, k], angle * normals[:, axis], len(total))
     flat = np.linalg.norm(total, axis=-1) < 1e-12
@@ -80,7 +86,7 @@ def edges(surface: Surface) -> Int:
 def mean_edge_length(surface: Surface) -> float:
     """Mean length of the faces' sides: of the edges, those at a border counting half."""
     corners = surface.vertices[surface.faces]
-    return float(np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1).mean())
+    return float(lengths(corners - corners[:, [1, 2, 0]]).mean())
 
 
 def is_closed(surface: Surface) -> bool:

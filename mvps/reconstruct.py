@@ -67,7 +67,7 @@ def second_pass(preset: str, free_lights: bool) -> RefineSettings:
             RoundSettings(0.8, 0.6, 0.2, crease=0.1),
         ),
     }[preset]
-    return RefineSettings(rounds, free_lights=free_lights, choose=True)
+    return RefineSettings(rounds, free_lights=free_lights, final=True)
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
@@ -226,13 +226,14 @@ def versions() -> dict[str, str]:
 
 def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them."""
-    from mvps.joint.refine import SHARPNESS
+    from mvps.joint.photometry import SHARPNESS
+    from mvps.joint.thinned import thinned
 
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     grid, surface = rough_shape(used, progress)
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
-        maps = photometric_stereo(used, start)
+        maps = photometric_stereo(*thinned(used, start))
     rough = stage_two("first refinement", used, surface, start, maps, Law(SHARPNESS), first_pass(lights is None), settings, progress)
     surface = stage_one(used, grid, rough.maps, settings, progress)
     plan = second_pass(settings.preset, lights is None)

@@ -36,7 +36,6 @@ def render_view(
     """
     import numpy as np
 
-    from mvps.mesh import mean_edge_length
     from mvps.rendering import light_arriving, photograph
     from mvps.scene import CaptureError
     from mvps.visibility import camera_hits
@@ -45,7 +44,6 @@ def render_view(
         raise CaptureError(f"views: wanted one of the result's {', '.join(reconstruction.views)}, given {view}; choose other --views")
     position = reconstruction.views.index(view)
     direction, intensity = reconstruction.lights.direction[position], reconstruction.lights.intensity[position]
-    offset = mean_edge_length(caster.surface)
     every = np.indices((camera.height, camera.width)).reshape(2, -1).T
     hit = camera_hits(caster, camera, every).face >= 0
     image = np.zeros((len(every), len(direction), 3), np.uint16)
@@ -54,7 +52,7 @@ def render_view(
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(chosen), step):
         part = chosen[start : start + step]
-        radiance = photograph(caster, reconstruction.material, camera, every[part], direction, intensity, offset, arriving)
+        radiance = photograph(caster, reconstruction.material, camera, every[part], direction, intensity, arriving)
         image[part] = np.rint((radiance * WHITE).clip(0, WHITE)).astype(np.uint16)
     return image.reshape(camera.height, camera.width, -1, 3), hit.reshape(camera.height, camera.width)
 

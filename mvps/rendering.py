@@ -46,10 +46,10 @@ def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: 
     return Points(position, normalise(mesh_normal), normalise(normal), albedo, weight, confidence, hits.face >= 0)
 
 
-def shadow_at(caster: RayCaster, points: Points, lights: Float, offset: float) -> Bool:
-    """(n, lights) True where another part of the mesh hides the light (lights, 3) from the point. Offset: see visibility.py."""
+def shadow_at(caster: RayCaster, points: Points, lights: Float) -> Bool:
+    """(n, lights) True where another part of the mesh hides the light (lights, 3) from the point."""
     rows, columns = np.nonzero((points.mesh_normal @ lights.T > 0) & points.hit[:, None])
-    origins = points.position + offset * points.mesh_normal
+    origins = points.position + caster.offset * points.mesh_normal
     shadow = np.zeros((len(points.hit), len(lights)), bool)
     shadow[rows, columns] = caster.occluded(origins[rows], lights[columns])
     return shadow
@@ -87,6 +87,15 @@ def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: fl
     return shaded
 
 
+def specular_shading(normal: Float, towards: Float, direction: Float, weight: Float, sharpness: Float) -> NDArray[np.float32]:
+    """(n, lights, 1 or 3) radiance over intensity of the lobes with weights (n, lobes[, 3]); else as `diffuse_shading`."""
+    n, v, light = (torch.tensor(a, dtype=torch.float32) for a in (normal, towards, direction))
+    of_channels = torch.tensor(weight if weight.ndim == 3 else weight[..., None], dtype=torch.float32)
+    black = torch.zeros(len(n), 1)
+    shaded: NDArray[np.float32] = shade(n, v, light, black, of_channels, Law(tuple(sharpness.tolist()))).numpy()
+    return shaded
+
+
 def photograph(
     caster: RayCaster,
     material: Material,
@@ -94,16 +103,15 @@ def photograph(
     pixels: Int,
     direction: Float,
     intensity: Float,
-    offset: float,
     arriving: Arriving | None = None,
 ) -> NDArray[np.float32]:
     """Radiance (n, lights, 3) at the centres of pixels (n, 2) under lights direction, intensity (lights, 3); 0 where nothing is hit.
 
-    offset: see visibility.py; arriving: inter-reflection under the same lights.
+    arriving: inter-reflection under the same lights.
     """
     points = points_under(caster, material, camera, pixels)
     view = view_directions(camera, points.position)
-    lit = ~shadow_at(caster, points, direction, offset)
+    lit = ~shadow_at(caster, points, direction)
     image = np.empty((len(pixels), len(direction), 3), np.float32)
     light = torch.tensor(direction, dtype=torch.float32)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))

@@ -145,8 +145,12 @@ class View:
 
     def usable(self, lights: slice | Sequence[int] = slice(None)) -> Bool:
         """(pixels, lights) True where no channel is saturated."""
-        usable: Bool = np.asarray((self.samples[:, lights] < self.saturation).all(-1))
-        return usable
+        return self._unclipped[:, lights]
+
+    @cached_property
+    def _unclipped(self) -> Bool:
+        below = self.samples < self.saturation
+        return below[..., 0] & below[..., 1] & below[..., 2]
 
 
 @dataclass(frozen=True, eq=False)

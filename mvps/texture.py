@@ -2,13 +2,14 @@
 
 Base colour. In every view, each foreground pixel with first hit x gets one albedo, from all its lights:
 
-    minimise over a   sum_l log(1 + r_l^2 / b^2),   r_l = I_l - E_l (a (n.l)+ + specular_l),     E intensity of the light,
+    minimise over a   sum_l log(1 + r_l^2 / b^2),   r_l = I_l - E_l (a d_l + specular_l),     E intensity of the light,
 
-over unsaturated samples of lights that reach x, by reweighted least squares. With the scale b, half the mean of |r|, highlights,
-shadow borders and inter-reflections count as outliers (Cauchy's weights: Holland and Welsch 1977). A texel takes the mean of
-these albedos, interpolated between pixels, over the views that see it, with weights of the squared density of pixels on the
-surface, (cos(view angle) / footprint^2)^2, so that the nearest and most frontal views decide. A view sees a texel where the
-first hits of the surrounding pixels lie at the texel. A texel that no view sees keeps the vertices' albedo.
+colours of lights taken out, d the diffuse shading and what other surfaces send, over unsaturated samples of lights that reach x, by
+reweighted least squares. With the scale b, half the mean of |r|, highlights, shadow borders and inter-reflections count as outliers
+(Cauchy's weights: Holland and Welsch 1977). A texel takes the mean of these albedos, interpolated between pixels, over the views that see
+it, with weights of the squared density of pixels on the surface, (cos(view angle) / footprint^2)^2, so that the nearest and most frontal
+views decide. A view sees a texel where the first hits of the surrounding pixels lie at the texel. A texel that no view sees keeps the
+vertices' albedo.
 
 Normal map. T, N: interpolated tangent and mesh normal, B = N x T; the refined normal n is stored as (x, y, z) with
 x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
@@ -19,7 +20,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -28,9 +29,9 @@ from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
-from mvps.mesh import face_areas, mean_edge_length, normalise, vertex_normals
+from mvps.mesh import face_areas, normalise, vertex_normals
 from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
-from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, photograph, points_under
+from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
 from mvps.scene import Bool, Capture, Float, Lights, Material, Surface, View
 from mvps.visibility import RayCaster
 
@@ -118,57 +119,52 @@ def pixel_albedo(
     view: View,
     direction: Float,
     intensity: Float,
-    offset: float,
     arriving: Arriving | None = None,
 ) -> tuple[Float, NDArray[np.float32], Bool]:
     """What the pixels of a view say of the albedo: first hits (pixels, 3), albedo (pixels, 3), and where there is one (pixels,)."""
     position = np.zeros((len(view.pixels), 3))
     albedo = np.zeros((len(view.pixels), 3), np.float32)
     known = np.zeros(len(view.pixels), bool)
-    bright = replace(material, albedo=np.ones_like(material.albedo))
+    level = intensity.mean(1).astype(np.float32)
+    ratio = intensity / level[:, None]
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(position), step):
         part = slice(start, start + step)
-        pixels = view.pixels[part]
-        points = points_under(caster, material, view.camera, pixels)
-        # An image with albedo 1 holds diffuse + specular; its diffuse part is known, and zero says: no light arrives.
-        model = photograph(caster, bright, view.camera, pixels, direction, intensity, offset)
+        points = points_under(caster, material, view.camera, view.pixels[part])
         towards = view_directions(view.camera, points.position)
-        diffuse = diffuse_shading(points.normal, towards, direction, material.grazing)[..., None] * intensity.astype(np.float32)
-        usable: Bool = (model[..., 0] > 0) & (diffuse[..., 0] > 0) & _usable(view, part)
-        measured = view.samples[part].astype(np.float32) * np.float32(view.scale) - (model - diffuse)
+        body = diffuse_shading(points.normal, towards, direction, material.grazing)
+        highlight = specular_shading(points.normal, towards, direction, points.specular_weight, material.sharpness)
+        usable: Bool = ~shadow_at(caster, points, direction) & (body > 0) & view.usable()[part] & points.hit[:, None]
+        # Channels first: numpy's loops are fast along a long last axis.
+        diffuse = np.broadcast_to(body, (3, *body.shape))
         if arriving is not None:
-            diffuse += arriving.at(points.position, points.mesh_normal) * intensity.astype(np.float32)
+            diffuse = diffuse + np.moveaxis(arriving.at(points.position, points.mesh_normal), -1, 0)
+        white = np.moveaxis(view.samples[part], -1, 0).astype(np.float32) * (view.scale / ratio.T[:, None]).astype(np.float32)
+        measured = white - np.moveaxis(highlight, -1, 0) * level
         position[part] = points.position
-        albedo[part] = _robust_albedo(measured, diffuse, usable)
-        known[part] = points.hit & usable.any(1)
+        albedo[part] = _robust_albedo(measured, diffuse * level, usable).T
+        known[part] = usable.any(1)
     return position, albedo, known
 
 
-def _usable(view: View, part: slice) -> Bool:
-    below = view.samples[part] < view.saturation
-    usable: Bool = below[..., 0] & below[..., 1] & below[..., 2]
-    return usable
-
-
 def _robust_albedo(measured: NDArray[np.float32], diffuse: NDArray[np.float32], usable: Bool) -> NDArray[np.float32]:
-    """(n, 3) robust fit a >= 0 of measured to a diffuse, over the usable (n, lights) of (n, lights, 3); 0 where none is."""
-    weight: Any = np.broadcast_to(usable[..., None], diffuse.shape).astype(np.float32)
-    tiny = np.float32(1e-30)
+    """(3, n) robust fit a >= 0 of measured (3, n, lights) to a diffuse, over the usable (n, lights); 0 where none is.
+
+    The channels share their weights: a highlight or a shadow's border is an outlier in all of them.
+    """
+    weight = usable.astype(np.float32)
+    albedo = np.zeros(measured.shape[:2], np.float32)
     for _ in range(REWEIGHTINGS):
-        weighted = weight * diffuse
-        albedo = _over_lights(weighted, measured) / np.maximum(_over_lights(weighted, diffuse), tiny)
-        residual = np.abs(measured - albedo[:, None] * diffuse) * usable[..., None]
-        bound = np.einsum("nlc->nc", residual)[:, None] / (2 * residual.shape[1]) + np.float32(1e-12)
-        weight = usable[..., None] / (1 + (residual / bound) ** 2)
-    solved: NDArray[np.float32] = albedo.clip(0)
-    return solved
-
-
-def _over_lights(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n, 3) sum over the lights of a b (n, lights, 3); einsum is several times faster here than a product and its sum."""
-    total: NDArray[np.float32] = np.einsum("nlc,nlc->nc", a, b)
-    return total
+        residual = np.zeros_like(weight)
+        for c, (image, shading) in enumerate(zip(measured, diffuse, strict=True)):
+            weighted = weight * shading
+            bottom = np.einsum("nl,nl->n", weighted, shading)
+            albedo[c] = np.einsum("nl,nl->n", weighted, image) / np.maximum(bottom, np.float32(1e-30))
+            residual += np.abs(image - albedo[c, :, None] * shading)
+        residual *= usable
+        bound = residual.mean(1, keepdims=True) / 2 + np.float32(1e-12)
+        weight = usable / (1 + (residual / bound) ** 2)
+    return albedo.clip(0)
 
 
 def _check_lights(lights: Lights, capture: Capture) -> None:
@@ -190,13 +186,12 @@ def _photographed_albedo(
 ) -> tuple[Float, Bool]:
     """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
     caster, sources = RayCaster(surface), light_sources(surface, material)
-    offset = mean_edge_length(surface)
     total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
 
     def solved(i: int) -> tuple[Float, NDArray[np.float32], Bool]:
         direction, intensity = lights.direction[i], lights.intensity[i]
         arriving = light_arriving(sources, material, direction)
-        hit, albedo, known = pixel_albedo(caster, material, capture.views[i], direction, intensity, offset, arriving)
+        hit, albedo, known = pixel_albedo(caster, material, capture.views[i], direction, intensity, arriving)
         return hit, albedo, known & _away_from_border(capture.views[i])
 
     for view, (hit, albedo, known) in zip(capture.views, _on_all_cores(solved, len(capture.views)), strict=True):

@@ -1,6 +1,6 @@
 """What sees what: first hits, cast shadows and visible vertices on a triangle mesh, by Embree.
 
-A ray that leaves the mesh starts `offset` away from it along the surface normal: a triangle mesh stands for a smooth
+A ray that leaves the mesh starts an `offset` away from it along the surface normal: a triangle mesh stands for a smooth
 surface only up to its own resolution, so nearer occluders are an artefact of the facets (shadow acne), not of the shape.
 """
 
@@ -12,11 +12,12 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from mvps.camera import pixel_centres, project, rays, view_directions
-from mvps.mesh import vertex_normals
+from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Bool, Camera, Float, Int, Surface
 
 RAYS_PER_CALL = 1 << 18
@@ -47,6 +48,11 @@ class RayCaster:
     def vertex_normals(self) -> Float:
         """(V, 3) vertex normals of the mesh, computed when first asked for."""
         return vertex_normals(self.surface)
+
+    @cached_property
+    def offset(self) -> float:
+        """Length below which the mesh has no detail: the mean of its edges. Rays that leave the mesh start this far away."""
+        return mean_edge_length(self.surface)
 
     def _local(self, points: Float) -> Any:
         return np.ascontiguousarray((points - self._centre) / self._scale, dtype=np.float32)
@@ -90,39 +96,38 @@ def camera_hits(caster: RayCaster, camera: Camera, pixels: Int) -> Hits:
 
 def interpolate(surface: Surface, hits: Hits, values: Float) -> Float:
     """Values (V, ...) on the vertices, interpolated at hits (n, ...); a miss gives zeros."""
-    corners = values[surface.faces[np.maximum(hits.face, 0)]]
-    weights = hits.barycentric.reshape(hits.barycentric.shape + (1,) * (values.ndim - 1))
-    interpolated: Float = (corners * weights).sum(1)
+    columns = surface.faces[np.maximum(hits.face, 0)]
+    weights = sp.csr_matrix(
+        (hits.barycentric.ravel(), columns.ravel(), np.arange(0, columns.size + 1, 3)), (len(columns), len(surface.vertices))
+    )
+    interpolated: Float = (weights @ values.reshape(len(values), -1)).reshape(len(columns), *values.shape[1:])
     return interpolated
 
 
-def visible_vertices(caster: RayCaster, camera: Camera, normal: Float, offset: float) -> Bool:
-    """(V,) True where a vertex lies on the image, faces the camera and nothing hides it.
-
-    normal (V, 3) are the surface's vertex normals; offset, world units, is the length below which the mesh has no detail.
-    """
-    vertices = caster.surface.vertices
+def visible_vertices(caster: RayCaster, camera: Camera) -> Bool:
+    """(V,) True where a vertex lies on the image, faces the camera and nothing hides it."""
+    vertices, normal = caster.surface.vertices, caster.vertex_normals
     image, depth = project(camera, vertices)
     towards = view_directions(camera, vertices)
-    candidates = (depth > 0) & ((normal * towards).sum(-1) > 0)
+    candidates = (depth > 0) & (np.einsum("ni,ni->n", normal, towards) > 0)
     candidates &= (image >= 0).all(-1) & (image[:, 0] < camera.width) & (image[:, 1] < camera.height)
     chosen = np.flatnonzero(candidates)
-    hidden = caster.occluded(vertices[chosen] + offset * normal[chosen], towards[chosen])
+    hidden = caster.occluded(vertices[chosen] + caster.offset * normal[chosen], towards[chosen])
     visible = np.zeros(len(vertices), bool)
     visible[chosen[~hidden]] = True
     return visible
 
 
-def cast_shadow(caster: RayCaster, vertices: Int, normal: Float, lights: Float, offset: float) -> Bool:
+def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
     """(n, lights) True where another part of the mesh hides a light from a vertex.
 
-    vertices (n,) indices; normal (V, 3) vertex normals; lights (lights, 3) unit, world, towards the light;
-    offset as in `visible_vertices`. Only lights above the horizon are traced: below it the shadow is attached, not cast.
+    vertices (n,) indices; lights (lights, 3) unit, world, towards the light. Only lights above the horizon are traced: below it the
+    shadow is attached, not cast.
     """
-    local = normal[vertices]
+    local = caster.vertex_normals[vertices]
     lit = local @ lights.T > 0
     rows, columns = np.nonzero(lit)
-    origins = (caster.surface.vertices[vertices] + offset * local)[rows]
+    origins = (caster.surface.vertices[vertices] + caster.offset * local)[rows]
     shadow = np.zeros(lit.shape, bool)
     shadow[rows, columns] = caster.occluded(origins, lights[columns])
     return shadow

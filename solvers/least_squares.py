@@ -48,8 +48,22 @@ def _solve_with_fixed(H: Tensor, gradient: Tensor, lower: Tensor, fixed: Tensor)
     right = torch.where(fixed, value, right)
     free = (~fixed).to(H.dtype)
     masked = H * free[:, :, None] * free[:, None, :] + torch.diag_embed(1 - free)
+    return _solved(masked, right)
+
+
+def columns_of_inverse(hessian: Tensor, wanted: int, damping: float = 1e-3) -> Tensor:
+    """(n, p, wanted) first columns of the inverses of the damped H (n, p, p)."""
+    H = damped(hessian, damping)
+    unit = torch.eye(H.shape[1], wanted, dtype=H.dtype, device=H.device)
+    return _solved(H, unit.expand(len(H), -1, -1))
+
+
+def _solved(H: Tensor, right: Tensor) -> Tensor:
+    """x (n, p[, k]) with H x = right (n, p[, k]); 0 where H is singular."""
     # Scaling to a unit diagonal first keeps the float32 factorisation accurate when the unknowns have different units.
-    scale = torch.diagonal(masked, dim1=1, dim2=2).clamp_min(1e-30).rsqrt()
-    scaled = masked * scale[:, :, None] * scale[:, None, :]
-    solution: Tensor = torch.linalg.solve_ex(scaled, (right * scale)[..., None])[0][..., 0] * scale
-    return torch.where(torch.isfinite(solution), solution, torch.zeros_like(solution))
+    scale = torch.diagonal(H, dim1=1, dim2=2).clamp_min(1e-30).rsqrt()
+    scaled = H * scale[:, :, None] * scale[:, None, :]
+    matrix = right if right.ndim == 3 else right[..., None]
+    solution: Tensor = torch.linalg.solve_ex(scaled, matrix * scale[..., None])[0] * scale[..., None]
+    solution = torch.where(torch.isfinite(solution), solution, torch.zeros_like(solution))
+    return solution if right.ndim == 3 else solution[..., 0]

@@ -13,8 +13,11 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
-TOLERANCE = 1e-9
-"""Of the residual in `nearby`, relative: far below the error of any measurement, far above rounding."""
+TOLERANCE = 1e-6
+"""Of the residual in `nearby`, relative: on a mesh of 66 000 vertices the solution is then 1e-4 pixels off at most."""
+
+MOST_STEPS = 100
+"""A factor of a nearby matrix needs a handful."""
 
 
 class CholeskyLike:
@@ -30,6 +33,20 @@ class CholeskyLike:
 
     def nearby(self, matrix: sp.spmatrix, right: NDArray[Any], start: NDArray[Any]) -> NDArray[np.float64]:
         """x (n, k) with matrix x = right (n, k) for a matrix near the factored one, from `start` (n, k)."""
-        preconditioner = spl.LinearOperator(matrix.shape, self._factor.solve)
-        columns = [spl.cg(matrix, b, x0, rtol=TOLERANCE, M=preconditioner)[0] for b, x0 in zip(right.T, start.T, strict=True)]
-        return np.stack(columns, axis=1)
+        x = np.array(start, dtype=np.float64)
+        residual = right - matrix @ x
+        enough = TOLERANCE**2 * (right**2).sum(0)
+        direction, before = np.zeros_like(x), np.ones(x.shape[1])
+        # Columns go in step, because one pass over the factor then serves all of them.
+        for _ in range(MOST_STEPS):
+            if ((residual**2).sum(0) <= enough).all():
+                break
+            conditioned = self._factor.solve(residual)
+            now = (residual * conditioned).sum(0)
+            direction = conditioned + now / before * direction
+            image = matrix @ direction
+            length = now / np.maximum((direction * image).sum(0), np.finfo(np.float64).tiny)
+            x += length * direction
+            residual -= length * image
+            before = np.maximum(now, np.finfo(np.float64).tiny)
+        return x

@@ -50,10 +50,13 @@ def solve_rows(M: NDArray[Any], W: NDArray[Any], Y: NDArray[Any], ridge: float =
 
 def robust_weights(residual: NDArray[Any], known: NDArray[Any], floor: float) -> NDArray[np.float64]:
     """Cauchy weights of residuals (m, n), scale per row from its known entries; `floor` is the smallest scale (noise)."""
-    absolute = np.where(known > 0, np.abs(residual), np.nan)
-    # A row without entries has no scale and needs none; a median of nothing would warn.
-    absolute[~(known > 0).any(1)] = 1.0
-    scale = np.maximum(np.nanmedian(absolute, axis=1, keepdims=True) * MAD_TO_SIGMA, max(floor, np.finfo(np.float64).tiny))
+    # Unknown entries are sorted to the end: numpy's nanmedian is many times slower.
+    ordered = np.sort(np.where(known > 0, np.abs(residual), np.inf), axis=1)
+    count = (known > 0).sum(1)
+    middle = [np.take_along_axis(ordered, np.maximum(k, 0)[:, None], 1) for k in ((count - 1) // 2, count // 2)]
+    # A row without entries has no scale and needs none.
+    median = np.where(count[:, None] > 0, (middle[0] + middle[1]) / 2, 1.0)
+    scale = np.maximum(median * MAD_TO_SIGMA, max(floor, np.finfo(np.float64).tiny))
     weights: NDArray[np.float64] = known / (1 + (residual / (CAUCHY_95 * scale)) ** 2)
     return weights
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 
-from mvps.mesh import mean_edge_length, normalise
+from mvps.mesh import normalise
 from mvps.rendering import photograph
 from mvps.scene import Camera, Capture, Lights, Material, Reconstruction, Surface, View
 from mvps.visibility import RayCaster, camera_hits, interpolate
@@ -54,7 +54,7 @@ def make_sphere(subdivisions: int = 4, coloured_lobes: bool = False, seed: int =
         hits = camera_hits(caster, camera, pixels)
         mask = (hits.face >= 0).reshape(camera.height, camera.width)
         direction = normalise(rig @ camera.rotation)
-        radiance = photograph(caster, material, camera, pixels[mask.ravel()], direction, intensity, mean_edge_length(surface))
+        radiance = photograph(caster, material, camera, pixels[mask.ravel()], direction, intensity)
         samples = np.rint((radiance / 2).clip(0, 1) * 65535).astype(np.uint16)
         views.append(View(f"view_{k + 1:02d}", camera, mask, samples, 2 / 65535, 65535, tuple(range(1, 11))))
         directions.append(direction)

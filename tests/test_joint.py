@@ -9,11 +9,11 @@ import pytest
 import torch
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_equations, vertex_jacobian
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_derivatives, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import observe
+from mvps.joint.photometry import grey_lights
 from mvps.joint.pixels import all_pixel_normals
-from mvps.joint.refine import grey_lights
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.vertices import Agreement, agreement, fuse, rotations
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
@@ -53,7 +53,7 @@ def test_derivatives_against_finite_differences(situation: str) -> None:
 
     lights = DirectionalLights(light, intensity)
     shaded = evaluate(normal, reflectance, view, lights, law, gathered)
-    by_vertex = vertex_jacobian(shaded, frame, view, lights)[0, :, 0]
+    by_vertex = torch.stack(vertex_derivatives(shaded, frame, view, lights), 1)[0, :, 0]
     by_light = light_jacobian(shaded, normal, view, lights, law, torch.eye(3, dtype=torch.float64))[0, 0]
     zero = torch.zeros(2, dtype=torch.float64)
     numeric = torch.autograd.functional.jacobian(image, (zero, reflectance, light * intensity))

@@ -11,7 +11,7 @@ from sphere_scene import SphereScene, make_sphere
 
 from mvps.joint.blocks import Vertices
 from mvps.joint.observe import observe
-from mvps.joint.refine import grey_lights
+from mvps.joint.photometry import grey_lights
 from mvps.joint.steps import free_reflectance
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, candidates, choose

@@ -290,7 +290,7 @@ def test_a_hidden_part_takes_no_colour_from_what_hides_it() -> None:
     material = Material(vertex_normals(surface), albedo, np.zeros((n + m, 0)), np.zeros(0), np.ones(n + m))
     view = scene.capture.views[0]
     lights = Lights(r.lights.direction[:1], r.lights.intensity[:1], True)
-    radiance = photograph(RayCaster(surface), material, view.camera, view.pixels, lights.direction[0], lights.intensity[0], 1.0)
+    radiance = photograph(RayCaster(surface), material, view.camera, view.pixels, lights.direction[0], lights.intensity[0])
     samples = np.rint(radiance / 2 * 65535).astype(np.uint16)
     wrong = replace(material, albedo=np.full_like(albedo, 0.1))
     textures = bake(surface, wrong, lights, Capture("two", (replace(view, samples=samples),)))
@@ -374,23 +374,23 @@ def test_saturated_samples_and_outliers_do_not_count(scene: SphereScene) -> None
     samples[:, 1] = 30000
     changed: View = replace(view, samples=samples)
     caster = RayCaster(r.surface)
-    hit, albedo, known = pixel_albedo(caster, r.material, changed, r.lights.direction[0], r.lights.intensity[0], 1.0)
+    hit, albedo, known = pixel_albedo(caster, r.material, changed, r.lights.direction[0], r.lights.intensity[0])
     frontal = known & (hit[:, 0] > 0.7 * RADIUS)
     assert frontal.sum() > 1000
     assert np.median(np.abs(albedo[frontal] - RIGHT_SIDE)) < 0.01
     nothing = replace(view, samples=np.full_like(samples, 65535))
-    assert not pixel_albedo(caster, r.material, nothing, r.lights.direction[0], r.lights.intensity[0], 1.0)[2].any()
+    assert not pixel_albedo(caster, r.material, nothing, r.lights.direction[0], r.lights.intensity[0])[2].any()
 
 
 @given(st.integers(0, 1000))
 def test_a_minority_of_outliers_is_ignored(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    diffuse = rng.uniform(0.2, 1, (4, 12, 3)).astype(np.float32)
-    truth = rng.uniform(0.1, 1, (4, 3)).astype(np.float32)
-    measured = truth[:, None] * diffuse
+    diffuse = rng.uniform(0.2, 1, (3, 4, 12)).astype(np.float32)
+    truth = rng.uniform(0.1, 1, (3, 4)).astype(np.float32)
+    measured = truth[..., None] * diffuse
     usable = np.ones((4, 12), bool)
-    measured[:, :2] += 0.5
-    usable[:, 5], measured[:, 5] = False, 9
+    measured[..., :2] += 0.5
+    usable[:, 5], measured[..., 5] = False, 9
     np.testing.assert_allclose(_robust_albedo(measured, diffuse, usable), truth, rtol=0.05, atol=0.02)
     assert (_robust_albedo(measured, diffuse, np.zeros_like(usable)) == 0).all()
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mvps.mesh import mean_edge_length, normalise, vertex_normals
+from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Surface
 from mvps.visibility import RayCaster, cast_shadow, interpolate
 
@@ -59,7 +59,7 @@ def test_a_small_sphere_casts_its_round_shadow_on_a_big_one() -> None:
     big, small = sphere(), sphere(0.3, (0, 0, 2))
     both = Surface(np.concatenate([big.vertices, small.vertices]), np.concatenate([big.faces, small.faces + len(big.vertices)]))
     light = np.array([[0.0, 0.0, 1.0]])
-    shadow = cast_shadow(RayCaster(both), np.arange(len(big.vertices)), vertex_normals(both), light, mean_edge_length(both))[:, 0]
+    shadow = cast_shadow(RayCaster(both), np.arange(len(big.vertices)), light)[:, 0]
     facing = big.vertices[:, 2] > 0.2
     distance = np.linalg.norm(big.vertices[:, :2], axis=1)
     assert shadow[facing & (distance < 0.28)].all() and not shadow[facing & (distance > 0.32)].any()
@@ -71,7 +71,7 @@ def test_a_convex_shape_casts_no_shadow_on_itself() -> None:
     ball = sphere()
     lights = normalise(np.random.default_rng(2).normal(size=(20, 3)))
     normal = vertex_normals(ball)
-    shadow = cast_shadow(RayCaster(ball), np.arange(len(normal)), normal, lights, mean_edge_length(ball))
+    shadow = cast_shadow(RayCaster(ball), np.arange(len(normal)), lights)
     assert shadow.mean() < 0.002
 
 

@@ -133,15 +133,15 @@ def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
     return lower * missing, -GRAZING_POWER * lower
 
 
-def vertex_jacobian(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> Tensor:
-    """(n, 3 + lobes, lights) derivatives of the samples by two tangential steps of the normal, the albedo and the weights."""
+def vertex_derivatives(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> list[Tensor]:
+    """3 + lobes derivatives (n, lights) of the samples by two tangential steps of the normal, the albedo and the weights."""
     along_light = shaded.lit * lights.intensity * shaded.reflectance
     q = shaded.n_dot_l * lights.intensity
     along_half = q * shaded.slope / shaded.c
     along_light = along_light + along_half + q * shaded.of_light
     along_view = along_half + q * shaded.of_view
     columns = [along_light * (t @ lights.direction.T) + along_view * (t * towards).sum(-1, keepdim=True) for t in frame]
-    return torch.stack(columns + shaded.basis, 1)
+    return columns + shaded.basis
 
 
 def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: DirectionalLights, law: Law, rotation: Tensor) -> Tensor:
@@ -166,9 +166,8 @@ def robust(residual: Tensor, scale: Tensor) -> Tensor:
 
 def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
     n, p = len(vertices.normal), 2 + vertices.reflectance.shape[1]
-    like = vertices.normal
-    hessian, gradient = like.new_zeros(n, p, p), like.new_zeros(n, p)
-    squares, count = like.new_zeros(n), like.new_zeros(n)
+    # One product of (jacobian, residual) with itself holds hessian, gradient and squares.
+    sums, count = vertices.normal.new_zeros(n, p + 1, p + 1), vertices.normal.new_zeros(n)
     first, second = tangents(vertices.normal)
     for samples, of_view in zip(views, lights, strict=True):
         for part in samples.chunks():
@@ -176,17 +175,14 @@ def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list
             shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
             residual = shaded.predicted - samples.image[part]
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
-            jacobian = vertex_jacobian(shaded, (first[index], second[index]), towards, of_view)
-            weighted = jacobian * weight[:, None]
-            hessian.index_add_(0, index, weighted @ jacobian.transpose(1, 2))
-            gradient.index_add_(0, index, (weighted @ residual[..., None])[..., 0])
-            squares.index_add_(0, index, (weight * residual**2).sum(1))
+            rows = torch.stack([*vertex_derivatives(shaded, (first[index], second[index]), towards, of_view), residual], 1)
+            sums.index_add_(0, index, (rows * weight[:, None]) @ rows.transpose(1, 2))
             count.index_add_(0, index, weight.sum(1))
-    return NormalEquations(hessian, gradient, squares, count)
+    return NormalEquations(sums[:, :p, :p].contiguous(), sums[:, :p, p].contiguous(), sums[:, p, p].contiguous(), count)
 
 
 def vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
-    """Normal equations of every vertex at the current state, unknowns as in `vertex_jacobian`.
+    """Normal equations of every vertex at the current state, unknowns as in `vertex_derivatives`.
 
     The views are dealt out to the cores in a fixed order and their sums added in that order, so that the result does not
     depend on which core was faster.

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_jacobian
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_derivatives
 from mvps.joint.observe import ViewSamples
 from mvps.joint.steps import LARGEST_TURN, Anchor
 from mvps.scene import Law
@@ -54,13 +54,16 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the lights of each view stand among the unknowns: one place for all views of a rig, else one after the other."""
+    """Where the lights of each view stand among the unknowns: one place for all views of a rig, else one after the other; total 0
+    where the lights are known."""
 
     start: list[int]
     total: int
 
 
-def _layout(lights: list[DirectionalLights], one_rig: bool) -> _Layout:
+def _layout(lights: list[DirectionalLights], one_rig: bool, free: bool) -> _Layout:
+    if not free:
+        return _Layout([0] * len(lights), 0)
     sizes = [len(of_view.intensity) for of_view in lights]
     if one_rig:
         return _Layout([0] * len(sizes), 3 * sizes[0])
@@ -88,8 +91,8 @@ def _coupled(
     cross, samples_of = like.new_zeros(n, p, unknowns), like.new_zeros(n)
     frame = tangents(vertices.normal)
     for samples, of_view, rotation, start in zip(views, lights, rotations, layout.start, strict=True):
-        width = 3 * len(of_view.intensity)
-        blocks = lights_hessian[start : start + width, start : start + width]
+        width = 3 * len(of_view.intensity) if layout.total else 0
+        of_lights = slice(start, start + width)
         for part in samples.chunks():
             index, towards = samples.vertex[part], samples.towards[part]
             normal = vertices.normal[index]
@@ -97,29 +100,30 @@ def _coupled(
             residual = shaded.predicted - samples.image[part]
             scale = vertices.scale[index]
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, scale) / scale[:, None] ** 2
-            of_vertex = vertex_jacobian(shaded, (frame[0][index], frame[1][index]), towards, of_view)
-            of_light = light_jacobian(shaded, normal, towards, of_view, law, rotation)
+            of_vertex = torch.stack(vertex_derivatives(shaded, (frame[0][index], frame[1][index]), towards, of_view), 1)
             of_law = torch.stack([shaded.grazing, shaded.indirect], -1)
             weighted = of_vertex * weight[:, None]
             hessian.index_add_(0, index, weighted @ of_vertex.transpose(1, 2))
             gradient.index_add_(0, index, (weighted @ residual[..., None])[..., 0])
             samples_of.index_add_(0, index, (weight * scale[:, None] ** 2).sum(1))
-            coupling = (weighted[..., None] * of_light[:, None]).reshape(len(index), p, width)
-            cross[:, :, start : start + width].index_add_(0, index, coupling)
             cross[:, :, layout.total :].index_add_(0, index, weighted @ of_law)
-            heavy = of_light * weight[..., None]
-            blocks += torch.block_diag(*torch.einsum("pli,plj->lij", heavy, of_light).double())
-            lights_gradient[start : start + width] += torch.einsum("pli,pl->li", heavy, residual).reshape(-1).double()
-            shared = torch.einsum("pli,plk->lik", heavy, of_law).reshape(width, OF_LAW).double()
-            lights_hessian[start : start + width, layout.total :] += shared
-            lights_hessian[layout.total :, start : start + width] += shared.T
+            if width:
+                of_light = light_jacobian(shaded, normal, towards, of_view, law, rotation)
+                coupling = (weighted[..., None] * of_light[:, None]).reshape(len(index), p, width)
+                cross[:, :, of_lights].index_add_(0, index, coupling)
+                heavy = of_light * weight[..., None]
+                lights_hessian[of_lights, of_lights] += torch.block_diag(*torch.einsum("pli,plj->lij", heavy, of_light).double())
+                lights_gradient[of_lights] += torch.einsum("pli,pl->li", heavy, residual).reshape(-1).double()
+                shared = torch.einsum("pli,plk->lik", heavy, of_law).reshape(width, OF_LAW).double()
+                lights_hessian[of_lights, layout.total :] += shared
+                lights_hessian[layout.total :, of_lights] += shared.T
             lights_hessian[layout.total :, layout.total :] += torch.einsum("pl,pli,plj->ij", weight, of_law, of_law).double()
             lights_gradient[layout.total :] += torch.einsum("pl,pli,pl->i", weight, of_law, residual).double()
     return lights_hessian, lights_gradient, hessian, gradient, cross, samples_of
 
 
-def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, solved: tuple[bool, bool, bool]) -> Tensor:
-    """dm of the Schur complement."""
+def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, solved: tuple[bool, bool]) -> Tensor:
+    """dm of the Schur complement. solved: grazing, bounce."""
     H, g, hessian, gradient, cross, samples_of = parts
     away = vertices.normal - anchor.normal
     strength = samples_of * (1 + away.square().sum(1) / FAR_OFF**2) ** -2 / anchor.sigma**2
@@ -142,7 +146,7 @@ def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor,
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
     diagonal = torch.diagonal(H).clamp_min(0)
     H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max())
-    wanted = torch.cat([torch.full((len(g) - OF_LAW,), solved[0]), torch.tensor(solved[1:])]).nonzero()[:, 0].to(g.device)
+    wanted = torch.cat([torch.full((len(g) - OF_LAW,), True), torch.tensor(solved)]).nonzero()[:, 0].to(g.device)
     step = torch.zeros_like(g)
     if len(wanted):
         step[wanted] = -torch.linalg.solve(H[wanted][:, wanted], g[wanted])
@@ -163,9 +167,12 @@ def light_step(
 
     rotations: camera_from_world of the views, float32.
     """
-    layout = _layout(lights, one_rig)
+    layout = _layout(lights, one_rig, free[0])
     parts = _coupled(views, vertices, lights, law, rotations, layout)
-    step = _reduced_step(parts, vertices, anchor, free)
+    step = _reduced_step(parts, vertices, anchor, free[1:])
+    law = _stepped_law(law, step[layout.total :], float(vertices.reflectance[:, 0].median()))
+    if not layout.total:
+        return lights, law
     stepped = []
     for of_view, rotation, start in zip(lights, rotations, layout.start, strict=True):
         m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T
@@ -175,7 +182,7 @@ def light_step(
         m = m + d
         intensity = m.norm(dim=1)
         stepped.append(DirectionalLights((m / intensity[:, None] @ rotation.double()).float(), intensity.float()))
-    return stepped, _stepped_law(law, step[layout.total :], float(vertices.reflectance[:, 0].median()))
+    return stepped, law
 
 
 def _stepped_law(law: Law, step: Tensor, albedo: float) -> Law:

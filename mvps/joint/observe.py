@@ -26,8 +26,8 @@ from torch import Tensor
 
 from mvps.bounce import Sources, gathered, interpolation
 from mvps.camera import bilinear, project, view_directions
-from mvps.mesh import mean_edge_length, vertex_normals
-from mvps.scene import Capture, Float, Int, Lights, Surface, View
+from mvps.mesh import vertex_normals
+from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, cast_shadow, visible_vertices
 
 SAMPLES_PER_CHUNK = 1 << 17
@@ -100,34 +100,35 @@ def _sampled(
     return corners @ image, ~lost
 
 
-def _pairs(view: View, caster: RayCaster, normal: Float, offset: float) -> tuple[Int, Float, Int, Float]:
-    """Vertices (n,) that a view sees, with the weight of the pair (n,) and the bilinear positions and weights (n, 4)."""
-    vertex = np.flatnonzero(visible_vertices(caster, view.camera, normal, offset))
-    points = caster.surface.vertices[vertex]
+def _pairs(view: View, caster: RayCaster, among: Bool | None = None) -> tuple[Int, Float, Int, Float]:
+    """Vertices (n,) that a view sees, with the weight of the pair (n,) and the bilinear positions and weights (n, 4). among (V,): only
+    these."""
+    visible = visible_vertices(caster, view.camera)
+    vertex = np.flatnonzero(visible if among is None else visible & among)
+    points, normal = caster.surface.vertices[vertex], caster.vertex_normals[vertex]
     positions, weights = bilinear(view.pixel_index, project(view.camera, points)[0])
     pure = (interior(view)[positions] * weights).sum(1)
-    pair = pure * np.maximum((normal[vertex] * view_directions(view.camera, points)).sum(1), 0) ** 2
+    pair = pure * np.maximum(np.einsum("ni,ni->n", normal, view_directions(view.camera, points)), 0) ** 2
     keep = pair > LIGHTEST_PAIR
     return vertex[keep], pair[keep], positions[keep], weights[keep]
 
 
 def visible_in(capture: Capture, surface: Surface) -> list[tuple[Int, Float]]:
     """Per view the vertices that it sees (n,) and the weight of each pair (n,)."""
-    caster, normal, offset = RayCaster(surface), vertex_normals(surface), mean_edge_length(surface)
-    return [_pairs(view, caster, normal, offset)[:2] for view in capture.views]
+    caster = RayCaster(surface)
+    return [_pairs(view, caster)[:2] for view in capture.views]
 
 
-def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device) -> list[ViewSamples]:
-    """The samples of all views on the vertices of `surface`; visibility and cast shadows are traced anew."""
-    caster, normal = RayCaster(surface), vertex_normals(surface)
-    offset = mean_edge_length(surface)
+def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None) -> list[ViewSamples]:
+    """The samples of all views on the vertices of `surface`, or on those `among` (V,); visibility and cast shadows are traced anew."""
+    caster = RayCaster(surface)
 
     def one(i: int) -> ViewSamples:
         view = capture.views[i]
-        vertex, pair, positions, weights = _pairs(view, caster, normal, offset)
+        vertex, pair, positions, weights = _pairs(view, caster, among)
         towards = view_directions(view.camera, surface.vertices[vertex])
         image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
-        shadow = cast_shadow(caster, vertex, normal, lights.direction[i], offset)
+        shadow = cast_shadow(caster, vertex, lights.direction[i])
         return ViewSamples(
             torch.from_numpy(vertex).to(device),
             torch.from_numpy(towards.astype(np.float32)).to(device),

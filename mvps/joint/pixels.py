@@ -20,7 +20,7 @@ from mvps.camera import view_directions
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_step
-from mvps.mesh import mean_edge_length, normalise
+from mvps.mesh import normalise
 from mvps.rendering import Points, points_under, shadow_at
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
 from mvps.visibility import RayCaster
@@ -61,16 +61,14 @@ def pixel_normals(
     material: Material,
     direction: Float,
     intensity: Float,
-    offset: float,
 ) -> NormalMap:
     """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
 
-    sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3); offset as
-    in visibility.py.
+    sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3).
     """
     points = points_under(caster, material, view.camera, view.pixels)
     hit = np.flatnonzero(points.hit)
-    samples = _samples(view, points, shadow_at(caster, points, direction, offset), intensity, hit)
+    samples = _samples(view, points, shadow_at(caster, points, direction), intensity, hit)
     if sources is not None:
         G = at(sources, gathered(sources, direction, material.bounce), points.position[hit], points.mesh_normal[hit])
         samples = replace(samples, gathered=torch.from_numpy(G))
@@ -99,7 +97,7 @@ def all_pixel_normals(
     capture: Capture, surface: Surface, material: Material, lights: Lights, sources: Sources | None
 ) -> tuple[NormalMap, ...]:
     """`pixel_normals` of every view, on all cores."""
-    caster, offset = RayCaster(surface), mean_edge_length(surface)
+    caster = RayCaster(surface)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
         tasks = zip(capture.views, lights.direction, lights.intensity, strict=True)
-        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, task[1], task[2], offset), tasks))
+        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, task[1], task[2]), tasks))

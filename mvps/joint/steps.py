@@ -18,7 +18,7 @@ from torch import Tensor
 from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
 from mvps.joint.observe import ViewSamples
 from mvps.scene import Law
-from solvers.least_squares import bounded_step, damped
+from solvers.least_squares import bounded_step, columns_of_inverse
 
 LARGEST_TURN = 0.3
 """Radians that a normal or light may turn in one step: the linearisation of n . l and of a lobe's flank ends there."""
@@ -119,9 +119,9 @@ def _sigma(equations: NormalEquations, vertices: Vertices) -> Tensor:
 
     Residuals are the model's error rather than noise, and samples under neighbouring lights share it: CORRELATED of them count as one.
     """
-    inverse = torch.linalg.inv_ex(damped(equations.hessian, 1e-3).double())[0]
-    variance = (inverse[:, 0, 0] + inverse[:, 1, 1]).clamp_min(0) / 2 * vertices.scale.double() ** 2 * CORRELATED
-    return torch.where(equations.count > 0, torch.nan_to_num(variance, nan=torch.inf).sqrt(), torch.inf)
+    inverse = columns_of_inverse(equations.hessian, 2)
+    variance = (inverse[:, 0, 0] + inverse[:, 1, 1]) / 2 * vertices.scale**2 * CORRELATED
+    return torch.where((equations.count > 0) & (variance > 0), variance.clamp_min(0).sqrt(), torch.inf)
 
 
 def confidence(vertices: Vertices) -> Tensor:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mvps.bounce import Sources
 from mvps.camera import DILIGENT_FROM_CAMERA
-from mvps.mesh import mean_edge_length
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.rendering import light_arriving, photograph, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View
@@ -42,14 +41,14 @@ def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Re
     chosen = shared[int(np.argsort(brightness, kind="stable")[len(shared) // 2])]
     row = reconstruction.light_names[place].index(view.lights[chosen])
     direction, intensity = (values[place][row : row + 1] for values in (reconstruction.lights.direction, reconstruction.lights.intensity))
-    material, offset = reconstruction.material, mean_edge_length(caster.surface)
+    material = reconstruction.material
     measured = view.radiance([chosen])[:, 0]
     arriving = light_arriving(sources, material, direction)
-    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, offset, arriving)[:, 0]
+    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)[:, 0]
     dark = replace(material, albedo=np.zeros_like(material.albedo))
-    specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity, offset)[:, 0]
+    specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity)[:, 0]
     points = points_under(caster, material, view.camera, view.pixels)
-    cast = shadow_at(caster, points, direction, offset)[:, 0]
+    cast = shadow_at(caster, points, direction)[:, 0]
     attached = points.normal @ direction[0] <= 0
     white = float(np.percentile(measured, 99.5)) or 1.0
     error = np.abs(measured - rendered).mean(1) / white

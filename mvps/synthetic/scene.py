@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvps.mesh import mean_edge_length, normalise
+from mvps.mesh import normalise
 from mvps.scene import Bool, Camera, Capture, Float, Lights, Material, Surface, Truth, View
 from mvps.synthetic.settings import SceneSettings
 from mvps.synthetic.shape import Shape, make_material, mesh_of
@@ -97,7 +97,7 @@ def photograph_scene(scene: Scene) -> tuple[tuple[Bool, ...], tuple[NDArray[np.f
     """
     from mvps.rendering import photograph
 
-    caster, offset = RayCaster(scene.surface), mean_edge_length(scene.surface)
+    caster = RayCaster(scene.surface)
     sub = np.stack(np.meshgrid(range(SUPERSAMPLING), range(SUPERSAMPLING), indexing="ij"), -1).reshape(-1, 2)
     masks, radiances, normal_maps = [], [], []
     for camera, direction, intensity in zip(scene.cameras, scene.lights.direction, scene.lights.intensity, strict=True):
@@ -106,7 +106,7 @@ def photograph_scene(scene: Scene) -> tuple[tuple[Bool, ...], tuple[NDArray[np.f
         normals = normalise(interpolate(scene.surface, hits, scene.material.normal)).astype(np.float32)
         normals[hits.face < 0] = np.nan
         pixels = (SUPERSAMPLING * np.argwhere(mask)[:, None] + sub).reshape(-1, 2)
-        fine = photograph(caster, scene.material, _supersampled(camera), pixels, direction, intensity, offset)
+        fine = photograph(caster, scene.material, _supersampled(camera), pixels, direction, intensity)
         masks.append(mask)
         radiances.append(fine.reshape(-1, len(sub), *fine.shape[1:]).mean(1))
         normal_maps.append(normals.reshape(camera.height, camera.width, 3))

@@ -1,0 +1,258 @@
+"""The photometric part of a round of Stage II: lights, law, normals and reflectance on a given mesh.
+
+samples (visibility and shadows traced anew) -> vertices for fixed lights -> lights with the vertices eliminated -> vertices -> normals
+of every view's own pixels (pixels.py)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
+from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.fused import vertex_maps
+from mvps.joint.lights import light_step, subset, with_mean_one
+from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
+from mvps.joint.pixels import all_pixel_normals
+from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, with_population
+from mvps.joint.thinned import thinned
+from mvps.joint.trial import held_out_errors
+from mvps.material import Model, Trial, candidates, choose
+from mvps.mesh import mean_edge_length, normalise, vertex_normals
+from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
+
+SHARPNESS = (8.0, 32.0, 128.0)
+"""Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
+
+LIGHT_VERTICES, TRIAL_VERTICES = 2000, 1000
+"""Vertices that stand for all when lights are solved, and when components of the model are tried."""
+
+MATERIAL_STEPS, CARRIED_STEPS = 3, 2
+LIGHT_STEPS = 3
+WEAK_TIE = 0.3
+"""Standard deviation, radians, of refined normals from the mesh's in the vertices' own steps: it only speaks where samples do not."""
+
+LIGHT_TIE = 0.01
+"""The same while the lights are solved. What all vertices' normals have in common is known from the mesh far better than from images, whose
+model is wrong alike for all of them; noise of single vertices averages out."""
+
+
+@dataclass
+class State:
+    """What one round hands to the next."""
+
+    surface: Surface
+    lights: Lights
+    maps: tuple[NormalMap, ...]
+    law: Law
+    vertices: Vertices | None = None
+    coarse: Gather | None = None
+    views: list[ViewSamples] = field(default_factory=list)
+    model: Model = field(default_factory=lambda: Model(SHARPNESS, True, True))
+    trials: list[Trial] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; thinned: vertices and pixels
+    under ENOUGH_LIGHTS lights of each view; device of the tensors."""
+
+    free_lights: bool
+    choose: bool
+    thinned: bool
+    device: torch.device
+
+
+def _tensor(values: Any, device: torch.device) -> torch.Tensor:
+    return torch.tensor(np.asarray(values), dtype=torch.float32, device=device)
+
+
+def grey_lights(lights: Lights, device: torch.device) -> list[DirectionalLights]:
+    """Directions and mean intensities as tensors."""
+    return [
+        DirectionalLights(_tensor(d, device), _tensor(e.mean(1), device)) for d, e in zip(lights.direction, lights.intensity, strict=True)
+    ]
+
+
+def coloured_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig: bool) -> Lights:
+    """Lights from directions, mean intensities and channel ratios (lights, 3)."""
+    directions = [normalise(of_view.direction.double().cpu().numpy()) for of_view in grey]
+    intensities = [of_view.intensity.double().cpu().numpy()[:, None] * r for of_view, r in zip(grey, ratios, strict=True)]
+    return Lights(tuple(directions), tuple(intensities), one_rig)
+
+
+def _started(
+    state: State, capture: Capture, lights: Lights, anchor: NDArray[Any], carried: tuple[Surface, Vertices] | None, device: torch.device
+) -> Vertices:
+    """Vertices of the new mesh: from the nearest vertex of the last round's, or from the views' photometric stereo."""
+    if carried is not None:
+        nearest = torch.from_numpy(cKDTree(carried[0].vertices).query(state.surface.vertices)[1])
+        old = carried[1]
+        return Vertices(old.normal[nearest], old.reflectance[nearest], old.scale[nearest])
+    seen = [(s.vertex.cpu().numpy(), s.weight.cpu().numpy()) for s in state.views]
+    normal, albedo, total = vertex_maps(capture, state.surface, state.maps, seen)
+    normal = np.where(total[:, None] > 0, normal, anchor)
+    # Under fewer than three lights a view's photometric stereo says nothing: albedo of Lambert's law under the mesh's normals.
+    lambert = lambert_albedo(state.views, _tensor(anchor, device), grey_lights(lights, device)).double().cpu().numpy()
+    albedo = np.where(total > 0, albedo, lambert)
+    level = float(np.median(albedo[albedo > 0])) if (albedo > 0).any() else 1.0
+    reflectance = torch.zeros(len(normal), 1 + len(state.law.sharpness), device=device)
+    reflectance[:, 0] = _tensor(albedo, device)
+    # No sample is an outlier before the first residuals are known.
+    return Vertices(_tensor(normal, device), reflectance, torch.full((len(normal),), level, device=device))
+
+
+def _drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) -> torch.Tensor:
+    """Indices of a random part of the vertices that are seen, in order."""
+    seen = torch.cat([samples.vertex for samples in views]).unique()
+    order = generator.permutation(len(seen))[:count]
+    drawn: torch.Tensor = seen[torch.from_numpy(np.sort(order)).to(seen.device)]
+    return drawn
+
+
+def _choose_model(state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, some: torch.Tensor) -> None:
+    """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account."""
+    few, part, tie = subset(few, start, anchor, some)
+    rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
+    lights = grey_lights(state.lights, some.device)
+    state.model, state.trials = choose(candidates(SHARPNESS), lambda model: held_out_errors(few, part, lights, tie, rotations, model))
+    law = state.law
+    state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
+
+
+def _solve_lights(
+    state: State, capture: Capture, few: list[ViewSamples], vertices: Vertices, anchor: Anchor, some: torch.Tensor, free_lights: bool
+) -> Lights:
+    """The lights solved on some vertices, which are solved along."""
+    few, part, tie = subset(few, vertices, anchor, some)
+    rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
+    lights = grey_lights(state.lights, some.device)
+    free = (free_lights, state.model.grazing, state.model.bounce)
+    for _ in range(LIGHT_STEPS):
+        lights, state.law = light_step(few, part, lights, state.law, tie, rotations, state.lights.one_rig, free)
+        lights, part = with_mean_one(lights, part)
+        for _ in range(2):
+            part = vertex_step(few, part, lights, state.law, tie)
+    return coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
+
+
+def angle_deg(a: Any, b: Any) -> Float:
+    """Degrees between unit vectors (..., 3)."""
+    degrees: Float = np.degrees(np.arccos(np.clip((np.asarray(a) * np.asarray(b)).sum(-1), -1, 1)))
+    return degrees
+
+
+def light_change(a: Lights, b: Lights) -> tuple[float, float]:
+    """Mean change of directions (deg) and of intensities (relative)."""
+    turned = np.concatenate([angle_deg(p, q) for p, q in zip(a.direction, b.direction, strict=True)])
+    before, after = np.concatenate(a.intensity), np.concatenate(b.intensity)
+    return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
+
+
+def _sources(state: State, vertices: Vertices) -> Sources | None:
+    """The patches that send light, with the vertices' albedo; None where inter-reflection is not modelled."""
+    if state.coarse is None or not state.model.bounce:
+        return None
+    return sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
+
+
+def photometric_round(
+    state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
+) -> dict[str, float]:
+    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
+    device = task.device
+
+    def lit() -> tuple[Capture, Lights]:
+        return thinned(capture, state.lights) if task.thinned else (capture, state.lights)
+
+    part, part_lights = lit()
+    state.views = observe(part, state.surface, part_lights, device)
+    mesh_normal = vertex_normals(state.surface)
+    vertices = _started(state, part, part_lights, mesh_normal, carried, device)
+    some = _drawn(state.views, LIGHT_VERTICES, generator)
+    few = state.views
+    if part is not capture:
+        among = np.zeros(len(mesh_normal), bool)
+        among[some.cpu().numpy()] = True
+        few = observe(capture, state.surface, state.lights, device, among)
+    if state.coarse is None:
+        state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
+
+    def with_sources(views: list[ViewSamples], lights: Lights) -> list[ViewSamples]:
+        sources = _sources(state, vertices)
+        return views if sources is None else with_gathered(views, state.surface, sources, state.law.bounce, lights)
+
+    if task.choose and not state.trials:
+        tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
+        trial = _drawn(few, TRIAL_VERTICES, generator)
+        _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial)
+        vertices = replace(vertices, reflectance=vertices.reflectance[:, : 1 + len(state.law.sharpness)])
+    free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
+    before, lights = vertices.normal, grey_lights(part_lights, device)
+    for _ in range(MATERIAL_STEPS if carried is None else CARRIED_STEPS):
+        vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    state.views = with_sources(state.views, part_lights)
+    few = state.views if part is capture else with_sources(few, state.lights)
+    free = with_population(state.views, vertices, lights, state.law, free)
+    solved = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
+    moved = light_change(state.lights, solved)
+    state.lights = solved
+    part, part_lights = lit()
+    lights = grey_lights(part_lights, device)
+    for _ in range(2):
+        last = vertices.normal
+        vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    state.vertices = vertices
+    state.maps = all_pixel_normals(part, state.surface, material_of(state, grey_albedo(vertices)), part_lights, _sources(state, vertices))
+    seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
+    turned, settling = (angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
+    return {
+        "residual": relative_residual(state.views, vertices),
+        "light_change_deg": moved[0],
+        "intensity_change": moved[1],
+        "normal_change_deg": float(np.mean(turned)),
+        "last_step_deg": float(np.mean(settling)),
+        "grazing": state.law.grazing,
+        "bounce": state.law.bounce,
+    }
+
+
+def grey_albedo(vertices: Vertices) -> Float:
+    """(V, 3) grey albedo, NaN where no sample says anything."""
+    assert vertices.sigma is not None
+    albedo = torch.where(vertices.sigma.isfinite(), vertices.reflectance[:, 0], torch.nan)
+    return albedo.double().cpu().numpy()[:, None].repeat(3, axis=1)
+
+
+def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
+    """Median over vertices of the residuals' standard deviation over the root mean square of the vertex's samples."""
+    square = torch.zeros_like(vertices.scale)
+    weight = torch.zeros_like(vertices.scale)
+    for samples in views:
+        for part in samples.chunks():
+            data = samples.data[part] * samples.weight[part, None]
+            square.index_add_(0, samples.vertex[part], (data * samples.image[part] ** 2).sum(1))
+            weight.index_add_(0, samples.vertex[part], data.sum(1))
+    seen = weight > 0
+    level = (square[seen] / weight[seen]).sqrt().clamp_min(1e-12)
+    return float((vertices.scale[seen] / level).median())
+
+
+def material_of(state: State, albedo: Float) -> Material:
+    """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
+    assert state.vertices is not None
+    vertices, known = state.vertices, np.isfinite(albedo).all(1)
+    nearest = np.arange(len(albedo))
+    nearest[~known] = np.flatnonzero(known)[cKDTree(state.surface.vertices[known]).query(state.surface.vertices[~known])[1]]
+    normal = normalise(vertices.normal.double().cpu().numpy())
+    normal[~known] = vertex_normals(state.surface)[~known]
+    weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
+    certain = confidence(vertices).double().cpu().numpy()
+    certain, law = np.where(known, certain, 0), state.law
+    return Material(normal, albedo[nearest], weight, np.array(law.sharpness), certain, law.grazing, law.bounce)
