@@ -17,6 +17,7 @@ import numpy as np
 from mvps import measures
 from mvps.joint.photometry import SHARPNESS
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
+from mvps.joint.thinned import thinned
 from mvps.load import read_capture, read_truth
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, first_lights, first_pass, photometric_stereo, rough_shape, stage_one, stage_two
@@ -43,8 +44,8 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     capture, truth, settings, progress = read_capture(path), read_truth(path), Settings(str(path)), Progress()
     grid, hull = rough_shape(capture, progress)
     lights = first_lights(capture, hull, None, settings.seed, progress)
-    maps = photometric_stereo(capture, lights)
-    state = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True), settings, progress)
+    maps = photometric_stereo(*thinned(capture, lights))
+    state = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)
     surface = stage_one(capture, grid, state.maps, settings, progress)
     records = [errors(capture, truth, state.lights, state.maps)]
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))

@@ -137,21 +137,26 @@ class OccupancyField(nn.Module):
         """base (nodes, 1) is the hull's signed distance on the nodes of base_grid."""
         super().__init__()
         self.base, self.base_grid, self.grids = base, base_grid, grids
-        self.active = 1
         width = len(grids.spacing) * features
         table = 0.1 * torch.randn(grids.nodes(), features, generator=generator)
         table[:, 0] = 0
-        self.table = nn.Parameter(table.to(base.device))
+        self.features = table.to(base.device)
+        self.activate(len(grids.spacing))
         first = torch.randn(hidden, width, generator=generator) * (2 / width) ** 0.5
         self.first = nn.Parameter(first.to(base.device))
         self.first_bias = nn.Parameter(torch.zeros(hidden, device=base.device))
         self.last = nn.Parameter(torch.zeros(1 + colours, hidden, device=base.device))
         self.last_bias = nn.Parameter(torch.zeros(1 + colours, device=base.device))
 
+    def activate(self, levels: int) -> None:
+        """Use the first `levels` grids only; `table`, whose gradients training asks for, is their part of the features."""
+        self.active = self.grids.finest(levels)
+        self.table = nn.Parameter(self.features[: self.active.nodes()])
+
     def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance (n,) and colour (n, colours) at points (n, 3)."""
         base = interpolate(self.base, points, self.base_grid).view(-1)
-        features = interpolate(self.table, points, self.grids.finest(self.active))
+        features = interpolate(self.table, points, self.active)
         flat = features.transpose(0, 1).flatten(1)
         hidden = torch.relu(torch.addmm(self.first_bias, flat, self.first[:, : flat.shape[1]].T))
         out = torch.addmm(self.last_bias, hidden, self.last.T)

@@ -142,7 +142,7 @@ def split_edges(surface: Surface, marked: Bool) -> Surface:
     return Surface(vertices, np.concatenate(faces))
 
 
-def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 3) -> Surface:
+def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) -> Surface:
     """The surface with edges of about `edge_length` (split, collapse, flip, relax: Botsch and Kobbelt 2004)."""
     from gpytoolbox import remesh_botsch
 

@@ -35,6 +35,7 @@ from mvps.field import Lattice, OccupancyField, SampledField, gradient, lattice
 from mvps.fieldrays import FieldRays, foreground_rays, ring_rays, trace
 from mvps.mesh import largest_component
 from mvps.scene import Capture, Float, NormalMap, SignedDistanceGrid, Surface
+from solvers.adam import Adam
 
 COLOURS = 6
 """Rendered features: albedo and normal, three channels each."""
@@ -72,19 +73,19 @@ class OccupancySettings:
     ring_rays: int = 512
     samples: int = 6
     ring_samples: int = 4
-    finest: float = 2.0
-    levels: int = 6
+    finest: float = 3.0
+    levels: int = 4
     features: int = 4
     hidden: int = 32
     band: tuple[float, float] = (16.0, 2.0)
     width: tuple[float, float] = (3.0, 0.5)
     step: tuple[float, float] = (2.0, 1.0)
     ring: int = 5
-    normal: float = 1.0
+    normal: float = 2.0
     colour: float = 0.5
     mask: float = 0.2
     smooth: float = 0.03
-    outlier: float = 0.5
+    outlier: tuple[float, float] = (2.0, 0.5)
     grid_rate: float = 0.1
     network_rate: float = 0.02
     voxel: float = 1.25
@@ -151,10 +152,9 @@ class _Training:
         self.seen = torch.zeros(len(data.anchor))
         self.ring_seen = torch.zeros(len(ring.anchor))
         self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long)
-        small = [field.first, field.first_bias, field.last, field.last_bias]
-        groups = [{"params": [field.table], "lr": settings.grid_rate}, {"params": small, "lr": settings.network_rate}]
+        self.small = [field.first, field.first_bias, field.last, field.last_bias]
         # A tiny epsilon: a node's gradients are small only because few rays pass it.
-        self.optimiser = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-12, fused=True)
+        self.optimiser = Adam([field.features, *self.small], betas=(0.9, 0.99), epsilon=1e-12)
 
     def widen(self, stride: int) -> None:
         """Take in the pixels of this stride and find the surface along their rays anew."""
@@ -195,7 +195,7 @@ class _Training:
         nearest = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
         return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-4, 1 - 1e-4), self.ring.inside[draw.chosen]), nearest
 
-    def surface_loss(self, draw: _Draw, band: float, width: float, step: float) -> tuple[Tensor, Tensor]:
+    def surface_loss(self, draw: _Draw, band: float, width: float, step: float, outlier: float) -> tuple[Tensor, Tensor]:
         """Normal, colour and smoothness along rays of foreground pixels, and where they meet the surface."""
         s, data, chosen = self.settings, self.data, draw.chosen
         distance, value, colour = self.march(data, draw, self.seen[chosen], band, s.samples)
@@ -210,20 +210,20 @@ class _Training:
         hit = (opacity.detach() > 0.5).float()
         trust = data.weight[chosen] * hit
         rendered = (weight[:, :, None] * colour).sum(1) / opacity[:, None].clamp_min(1e-3)
-        of_normal = (trust * robust_square((normal - data.normal[chosen]).square().sum(1), s.outlier)).mean()
-        of_colour = (trust * robust_square((rendered - data.colour[chosen]).square().sum(1), s.outlier)).mean()
-        of_smooth = (hit[:few] * robust_square((normal[:few] - other).square().sum(1), s.outlier)).mean()
+        of_normal = (trust * robust_square((normal - data.normal[chosen]).square().sum(1), outlier)).mean()
+        of_colour = (trust * robust_square((rendered - data.colour[chosen]).square().sum(1), outlier)).mean()
+        of_smooth = (hit[:few] * robust_square((normal[:few] - other).square().sum(1), outlier)).mean()
         loss = s.normal * of_normal + s.colour * of_colour + s.smooth * of_smooth
         return loss, torch.where(opacity > 0.5, depth, nearest).detach()
 
-    def step(self, band: float, width: float, step: float) -> float:
-        """One step of the optimiser; the loss. The parts of a batch are independent and run on a core each."""
+    def step(self, band: float, width: float, step: float, outlier: float, rate: float) -> float:
+        """One step of the optimiser, rates times `rate`; the loss. The parts of a batch are independent and run on a core each."""
         s = self.settings
         draws, ring_draws = self._draw(self.pool, s.rays), self._draw(self.ring_pool, s.ring_rays)
-        parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
+        parameters = [self.field.table, *self.small]
 
         def part(k: int) -> tuple[float, tuple[Tensor, ...], Tensor, Tensor]:
-            loss, seen = self.surface_loss(draws[k], band, width, step)
+            loss, seen = self.surface_loss(draws[k], band, width, step, outlier)
             of_mask, ring_seen = self.mask_loss(ring_draws[k], band, width)
             total = (loss + s.mask * of_mask) / PARTS
             return float(total.detach()), torch.autograd.grad(total, parameters), seen, ring_seen
@@ -231,11 +231,8 @@ class _Training:
         parts = list(self.pool_of_threads.map(part, range(PARTS)))
         for draw, ring_draw, (_, _, seen, ring_seen) in zip(draws, ring_draws, parts, strict=True):
             self.seen[draw.chosen], self.ring_seen[ring_draw.chosen] = seen, ring_seen
-        for p, *of_parts in zip(parameters, *(gradients for _, gradients, _, _ in parts), strict=True):
-            p.grad = of_parts[0]
-            for more in of_parts[1:]:
-                p.grad += more
-        self.optimiser.step()
+        rates = [rate * s.grid_rate] + [rate * s.network_rate] * len(self.small)
+        self.optimiser.step(list(zip(*(gradients for _, gradients, _, _ in parts), strict=True)), rates, self.pool_of_threads)
         return sum(loss for loss, *_ in parts)
 
     def run(self, on_step: Callable[[int, float], None]) -> None:
@@ -246,11 +243,10 @@ class _Training:
             progress = k / s.steps
             if k == 0 or int(progress * len(strides)) != int((k - 1) / s.steps * len(strides)):
                 self.widen(strides[int(progress * len(strides))])
-            self.field.active = max(2, min(s.levels, 2 + int(progress / 0.6 * (s.levels - 1))))
-            band, width, step = (_between(pair, 1.5 * progress) for pair in (s.band, s.width, s.step))
-            for group, rate in zip(self.optimiser.param_groups, (s.grid_rate, s.network_rate), strict=True):
-                group["lr"] = rate * min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
-            on_step(k, self.step(band, width, step))
+            self.field.activate(max(2, min(s.levels, 2 + int(progress / 0.6 * (s.levels - 1)))))
+            band, width, step, outlier = (_between(pair, 1.5 * progress) for pair in (s.band, s.width, s.step, s.outlier))
+            rate = min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
+            on_step(k, self.step(band, width, step, outlier, rate))
 
 
 def _frame(capture: Capture, grid: SignedDistanceGrid) -> _Frame:

@@ -45,27 +45,23 @@ class Settings:
     seed: int = 0
 
 
-def first_pass(free_lights: bool) -> RefineSettings:
-    """Rounds on the hull: lights and normals good enough for Stage I. Sweeps reach as far as a hull bulges over shallow hollows."""
+def first_pass(free_lights: bool, final: bool) -> RefineSettings:
+    """Rounds on the hull: lights and normals good enough for Stage I, or all there is (final). Sweeps reach as far as a hull bulges over
+    shallow hollows."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    fused = (RoundSettings(2.0, 4.0, 0.5, photometric=False), RoundSettings(2.0, 3.0, 0.5, photometric=False))
-    return RefineSettings((*fused, RoundSettings(2.0, 2.0, 0.4)), free_lights=free_lights)
+    fused = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(3.0, 3.0, 0.5, photometric=False))
+    return RefineSettings((*fused, RoundSettings(2.0 if final else 3.0, 2.0, 0.4)), free_lights=free_lights, final=final)
 
 
 def second_pass(preset: str, free_lights: bool) -> RefineSettings:
     """Rounds after Stage I; edges in pixels, sweeps reach as far as Stage I may be off."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
+    first = RoundSettings(1.5, 1.8, 0.3)
     rounds = {
-        "draft": (RoundSettings(1.5, 1.8, 0.3),),
-        "standard": (RoundSettings(1.5, 1.8, 0.3), RoundSettings(1.5, 1.2, 0.3, crease=0.1)),
-        "fine": (
-            RoundSettings(1.5, 1.8, 0.3),
-            RoundSettings(1.0, 1.2, 0.3),
-            RoundSettings(0.8, 1.2, 0.3, crease=0.2),
-            RoundSettings(0.8, 0.6, 0.2, crease=0.1),
-        ),
+        "standard": (first, RoundSettings(1.5, 1.2, 0.3, crease=0.1)),
+        "fine": (first, RoundSettings(1.0, 1.2, 0.3), RoundSettings(0.8, 1.2, 0.3, crease=0.2), RoundSettings(0.8, 0.6, 0.2, crease=0.1)),
     }[preset]
     return RefineSettings(rounds, free_lights=free_lights, final=True)
 
@@ -234,14 +230,20 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
         maps = photometric_stereo(*thinned(used, start))
-    rough = stage_two("first refinement", used, surface, start, maps, Law(SHARPNESS), first_pass(lights is None), settings, progress)
-    surface = stage_one(used, grid, rough.maps, settings, progress)
-    plan = second_pass(settings.preset, lights is None)
-    refined = stage_two("joint refinement", used, surface, rough.lights, rough.maps, rough.law, plan, settings, progress)
+    law, free = Law(SHARPNESS), lights is None
+    rounds: list[dict[str, float]] = []
+    if settings.preset == "draft":
+        refined = stage_two("joint refinement", used, surface, start, maps, law, first_pass(free, True), settings, progress)
+    else:
+        rough = stage_two("first refinement", used, surface, start, maps, law, first_pass(free, False), settings, progress)
+        rounds = rough.rounds
+        surface = stage_one(used, grid, rough.maps, settings, progress)
+        plan = second_pass(settings.preset, free)
+        refined = stage_two("joint refinement", used, surface, rough.lights, rough.maps, rough.law, plan, settings, progress)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined)
         pictures = normal_pictures(capture, used, refined)
-    metrics = {"stages": progress.stages, "rounds": rough.rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
+    metrics = {"stages": progress.stages, "rounds": rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
     metrics["model"] = {
         "components": [asdict(trial) for trial in refined.trials],
         "sharpness": list(refined.law.sharpness),

@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
-from mvps.mesh import face_areas, normalise, vertex_normals
+from mvps.mesh import face_areas, lengths, normalise, vertex_normals
 from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
-from mvps.scene import Bool, Capture, Float, Lights, Material, Surface, View
+from mvps.scene import Bool, Capture, Float, Int, Lights, Material, Surface, View
 from mvps.visibility import RayCaster
 
 TEXELS_PER_PIXEL = 2
@@ -188,21 +188,25 @@ def _photographed_albedo(
     caster, sources = RayCaster(surface), light_sources(surface, material)
     total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
 
-    def solved(i: int) -> tuple[Float, NDArray[np.float32], Bool]:
-        direction, intensity = lights.direction[i], lights.intensity[i]
+    def solved(i: int) -> list[tuple[Int, Float, Float]]:
+        view, direction, intensity = capture.views[i], lights.direction[i], lights.intensity[i]
         arriving = light_arriving(sources, material, direction)
-        hit, albedo, known = pixel_albedo(caster, material, capture.views[i], direction, intensity, arriving)
-        return hit, albedo, known & _away_from_border(capture.views[i])
-
-    for view, (hit, albedo, known) in zip(capture.views, _on_all_cores(solved, len(capture.views)), strict=True):
+        hit, albedo, known = pixel_albedo(caster, material, view, direction, intensity, arriving)
+        known &= _away_from_border(view)
+        parts = []
         for start in range(0, len(position), TEXELS_PER_CHUNK):
             part = slice(start, start + TEXELS_PER_CHUNK)
-            sampled, weight = _sampled(view, hit, albedo, known, position[part], normal[part])
-            total[part] += weight[:, None] * sampled
-            weights[part] += weight
-    seen = weights > 0
-    total[seen] /= weights[seen, None]
-    return total, seen
+            seen, sampled, weight = _sampled(view, hit, albedo, known, position[part], normal[part])
+            parts.append((start + seen, sampled, weight))
+        return parts
+
+    for parts in _on_all_cores(solved, len(capture.views)):
+        for seen, sampled, weight in parts:
+            total[seen] += weight[:, None] * sampled
+            weights[seen] += weight
+    known = weights > 0
+    total[known] /= weights[known, None]
+    return total, known
 
 
 def _on_all_cores(task: Callable[[int], Any], total: int) -> Iterator[Any]:
@@ -220,24 +224,22 @@ def _away_from_border(view: View) -> Bool:
     return away
 
 
-def _sampled(view: View, hit: Float, albedo: NDArray[np.float32], known: Bool, position: Float, normal: Float) -> tuple[Float, Float]:
-    """Albedo (n, 3) of the pixels around surface points (n, 3) and its weight (n,), 0 where the view does not see the point."""
-    facing = (normal * view_directions(view.camera, position)).sum(-1)
+def _sampled(view: View, hit: Float, albedo: NDArray[np.float32], known: Bool, position: Float, normal: Float) -> tuple[Int, Float, Float]:
+    """Which of some surface points (m, 3) the view sees (n,), the albedo (n, 3) of the pixels around them, and its weight (n,)."""
+    facing = np.einsum("ni,ni->n", normal, view_directions(view.camera, position))
     image, depth = project(view.camera, position)
     chosen = np.flatnonzero((facing > STEEPEST_VIEW) & (depth > 0) & inside_image(view.camera, image))
     where, share = bilinear(view.pixel_index, image[chosen])
     pixel = footprint(view.camera, position[chosen])
     # The four pixels around the point hit the surface within a diagonal of it, stretched by the slope.
-    near = np.linalg.norm(hit[where] - position[chosen, None], axis=-1) < (np.sqrt(2) * pixel / facing[chosen])[:, None]
+    near = lengths(hit[where] - position[chosen, None]) < (np.sqrt(2) * pixel / facing[chosen])[:, None]
     share = share * (near & known[where])
     total = share.sum(1)
     # Where the point hides behind another part, all four pixels hit that part instead.
     sees = total > 0.5
-    result, weight = np.zeros((len(position), 3)), np.zeros(len(position))
-    result[chosen[sees]] = (share[sees, :, None] * albedo[where[sees]]).sum(1) / total[sees, None]
+    result = np.einsum("nk,nkc->nc", share[sees], albedo[where[sees]]) / total[sees, None]
     density = facing[chosen] / pixel**2
-    weight[chosen[sees]] = (density**2 * total)[sees]
-    return result, weight
+    return chosen[sees], result, (density**2 * total)[sees]
 
 
 def _tangent_space(atlas: Atlas, texels: Texels, mesh_normal: Float, refined: Float) -> Float:

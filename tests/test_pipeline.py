@@ -22,8 +22,8 @@ COMPARED = ("mesh.ply", "material.npz", "lights.json", "model.glb", "model.obj",
 """Files without times or paths in them."""
 
 
-def reconstructed(capture: Path, out: Path, *options: str) -> Path:
-    assert run(reconstruct.main, [str(capture), "--out", str(out), "--preset", "draft", "--quiet", *options]) == 0
+def reconstructed(capture: Path, out: Path, *options: str, preset: str = "standard") -> Path:
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--preset", preset, "--quiet", *options]) == 0
     return out
 
 
@@ -54,6 +54,13 @@ def test_figures_of_the_embedded_capture(capture: Path, result: Path) -> None:
     assert "ground truth" in (result / "report.html").read_text().lower()
 
 
+def test_a_draft_goes_without_the_occupancy_field(capture: Path, tmp_path: Path) -> None:
+    out = reconstructed(capture, tmp_path / "draft", preset="draft")
+    assert "occupancy field" not in {stage["name"] for stage in read_reconstruction(out).metrics["stages"]}
+    found = figures(out, capture)
+    assert found["light_error_deg"] < 1.0 and found["map_normal_error_deg"] < 4.0 and found["chamfer_px"] < 0.5
+
+
 def test_all_files_of_a_result_are_there_and_read_back(capture: Path, result: Path) -> None:
     names = {path.name for path in result.iterdir()}
     assert {"mesh.ply", "model.glb", "model.obj", "model.mtl", "lights.json", "material.npz", "report.html"} <= names
@@ -62,7 +69,7 @@ def test_all_files_of_a_result_are_there_and_read_back(capture: Path, result: Pa
     read = read_reconstruction(result)
     assert read.views == tuple(f"view_{k:02d}" for k in range(1, 9)) and read.metrics["status"]["text"]
     assert {stage["name"] for stage in read.metrics["stages"]} >= {"load", "visual hull", "occupancy field", "joint refinement", "textures"}
-    assert read.settings["preset"] == "draft" and "torch" in read.settings["versions"]
+    assert read.settings["preset"] == "standard" and "torch" in read.settings["versions"]
 
 
 def test_without_ground_truth_the_same_bytes_come_out(capture: Path, result: Path, tmp_path: Path) -> None:

@@ -37,13 +37,17 @@ WORKERS = 2
 
 @dataclass
 class Vertices:
-    """What is known about the vertices: normal (V, 3); reflectance (V, 1 + lobes) grey albedo and weights; scale (V,) of residuals;
-    sigma (V,) standard deviation of the normal in radians as of the last step, infinite without samples, None before the first."""
+    """What is known about the vertices: normal (V, 3); reflectance (V, 1 + lobes) grey albedo and weights; scale (V,) of residuals.
+
+    As of the last step, None before the first: sigma (V,) standard deviation of the normal in radians, infinite without samples; said
+    (V, 1 + lobes) how much the samples say of each reflectance, the diagonal of the normal equations.
+    """
 
     normal: Tensor
     reflectance: Tensor
     scale: Tensor
     sigma: Tensor | None = None
+    said: Tensor | None = None
 
 
 @dataclass(frozen=True)

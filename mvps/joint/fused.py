@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from mvps.camera import bilinear, project, view_directions
-from mvps.mesh import face_normals, normalise
+from mvps.joint.blocks import WORKERS
+from mvps.mesh import face_normals, lengths, normalise
 from mvps.scene import Capture, Float, Int, NormalMap, Surface
 
 LEAST_WEIGHT = 1e-3
@@ -35,13 +38,19 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
     faces = surface.faces
     centre, facing = surface.vertices[faces].mean(1), face_normals(surface)
     total = np.zeros((len(faces), 3))
-    for view, photometric, index in zip(capture.views, maps, seen, strict=True):
+
+    def of_view(i: int) -> tuple[Int, Float]:
+        view, photometric = capture.views[i], maps[i]
         visible = np.zeros(len(surface.vertices), bool)
-        visible[index] = True
+        visible[seen[i]] = True
         chosen = np.flatnonzero(visible[faces].all(1))
         positions, corners = bilinear(view.pixel_index, project(view.camera, centre[chosen])[0])
-        cosine = (facing[chosen] * view_directions(view.camera, centre[chosen])).sum(1).clip(0)
+        cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, centre[chosen])).clip(0)
         w = corners * photometric.confidence[positions] * cosine[:, None] ** 2
-        total[chosen] += (photometric.normal[positions] * w[..., None]).sum(1)
-    known = np.linalg.norm(total, axis=1, keepdims=True) > LEAST_WEIGHT
+        return chosen, np.einsum("nkc,nk->nc", photometric.normal[positions], w)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for chosen, summed in pool.map(of_view, range(len(capture.views))):
+            total[chosen] += summed
+    known = lengths(total)[:, None] > LEAST_WEIGHT
     return np.where(known, normalise(total), normalise(otherwise[faces].sum(1)))

@@ -199,7 +199,7 @@ def photometric_round(
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.views = with_sources(state.views, part_lights)
     few = state.views if part is capture else with_sources(few, state.lights)
-    free = with_population(state.views, vertices, lights, state.law, free)
+    free = with_population(vertices, free)
     solved = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
     moved = light_change(state.lights, solved)
     state.lights = solved

@@ -101,10 +101,11 @@ def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, s
     else:
         agreed = agreement(capture, surface, state.maps, seen, reach * pixel, COST_SMOOTHINGS)
     # Faces turn and move, so that other pixels speak for them: twice.
+    factor = None
     for _ in range(FUSIONS):
         outward = vertex_normals(surface)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
-        moved = fuse(surface, target, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel)
+        moved, factor = fuse(surface, target, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel, factor)
         agreed = Agreement(agreed.offset - ((moved.vertices - surface.vertices) * outward).sum(1), agreed.sigma)
         surface = moved
     return surface

@@ -54,11 +54,11 @@ def free_reflectance(normal: Tensor, sigma: float, unknowns: int) -> Anchor:
     return Anchor(normal, sigma, nothing, nothing + torch.inf)
 
 
-def with_population(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor) -> Anchor:
+def with_population(vertices: Vertices, anchor: Anchor) -> Anchor:
     """The anchor with every lobe's weight tied to the object's: mean and standard deviation over the vertices, each by what its samples say
     of that lobe (empirical Bayes). A lobe that no light has excited at a vertex would otherwise be free, and blaze under another light."""
-    equations = vertex_equations(views, vertices, lights, law)
-    said = torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:].double()
+    assert vertices.said is not None
+    said = vertices.said.double()
     share = said / said.sum(0).clamp_min(1e-300)
     mean = (share * vertices.reflectance).sum(0)
     sigma = (share * (vertices.reflectance - mean) ** 2).sum(0).sqrt()
@@ -97,7 +97,7 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     equations = vertex_equations(views, vertices, lights, law)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
     vertices = replace(vertices, scale=scale.clamp_min(_least_scale(scale[equations.count > 0], vertices.reflectance[:, 0])))
-    sigma = _sigma(equations, vertices)
+    sigma, said = _sigma(equations, vertices), torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:].clone()
     add_ties(equations, vertices, anchor)
     lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
     step = bounded_step(equations.hessian, equations.gradient, lower)
@@ -105,7 +105,7 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     turn = turn * (LARGEST_TURN / turn.norm(dim=1, keepdim=True).clamp_min(LARGEST_TURN))
     first, second = tangents(vertices.normal)
     normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
-    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale, sigma)
+    return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale, sigma, said)
 
 
 def _least_scale(scale: Tensor, albedo: Tensor) -> float:

@@ -1,7 +1,7 @@
 """Fewer lights of every view, for steps on the way.
 
-Of a view's L lights every k-th stays, k = floor(L / enough), other ones in the next view: what one light does not show of a place, another
-view's light does.
+Of a view's L lights every k-th stays, other ones in the next view: what one light does not show of a place, another view's light does. k is
+the largest number that leaves ENOUGH_LIGHTS of each view and ENOUGH_PHOTOGRAPHS in all.
 """
 
 from __future__ import annotations
@@ -12,11 +12,17 @@ ENOUGH_LIGHTS = 12
 """Two samples for each of a pixel's six unknowns: two of the normal, albedo, three lobes."""
 
 
+ENOUGH_PHOTOGRAPHS = 240
+"""Twenty views of a dozen lights. With five views of bunny, whose vertices are seen twice, half of the 32 lights were too few: the surface
+ended 0.33 pixels off instead of 0.26."""
+
+
 def thinned(capture: Capture, lights: Lights) -> tuple[Capture, Lights]:
-    """The capture with at least ENOUGH_LIGHTS lights of each view (all where there are no more), and their lights."""
+    """The capture with fewer lights of each view, all where there are no more than enough, and their lights."""
     keep = {}
+    spare = sum(len(view.lights) for view in capture.views) // ENOUGH_PHOTOGRAPHS
     for i, view in enumerate(capture.views):
-        k = max(1, len(view.lights) // ENOUGH_LIGHTS)
+        k = max(1, min(len(view.lights) // ENOUGH_LIGHTS, spare))
         keep[view.name] = list(range(i % k, len(view.lights), k))
     if all(len(keep[view.name]) == len(view.lights) for view in capture.views):
         return capture, lights

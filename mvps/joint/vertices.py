@@ -17,6 +17,7 @@ radians, a the mean area of a vertex (normals are independent from vertex to ver
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -26,12 +27,16 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mvps.camera import project, view_directions
+from mvps.joint.blocks import WORKERS
 from mvps.mesh import edges, face_areas, face_normals, vertex_normals
-from mvps.scene import Capture, Float, Int, NormalMap, Surface
+from mvps.scene import Capture, Float, Int, NormalMap, Surface, View
 from solvers.linear import CholeskyLike
 
 MINIMUM_VIEWS = 1.5
 """Effective number of views, (sum w)^2 / sum w^2, from which their agreement says something."""
+
+SWEEPS = 3
+"""Reweightings of the agreed positions: each of the two fusions of a round then starts near the weights of the one before."""
 
 FAR_OFF = 3.0
 """Standard deviations from which an agreed position counts as an outlier (Cauchy's scale)."""
@@ -63,32 +68,45 @@ def _remap(image: NDArray[np.float32], at: Float) -> NDArray[np.float32]:
     return out
 
 
+def _facing(view: View, points: Float, normal: Float) -> NDArray[np.float32]:
+    """(n,) squared cosine of the viewing angle."""
+    cosine = np.einsum("ni,ni->n", normal, view_directions(view.camera, points))
+    squared: NDArray[np.float32] = np.maximum(cosine, 0).astype(np.float32) ** 2
+    return squared
+
+
 def agreement(
     capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Int], offsets: Float, smoothing: int
 ) -> Agreement:
     """Where along its normal each vertex agrees best between views. seen: per view the indices of vertices it sees;
     offsets (n,) evenly spaced, world units; smoothing: how often costs are averaged over neighbours."""
     normal = vertex_normals(surface)
-    vertices = len(normal)
-    total = np.zeros((len(offsets), vertices), np.float32)
-    first = np.zeros((len(offsets), vertices, 3), np.float32)
-    second = np.zeros((len(offsets), vertices), np.float32)
-    weights_squared = np.zeros(vertices)
-    weights_sum = np.zeros(vertices)
-    for view, photometric, index in zip(capture.views, maps, seen, strict=True):
-        image = feature_image(photometric, view.mask, view.pixel_index)
-        local, points = normal[index], surface.vertices[index]
-        cosine = np.maximum((local * view_directions(view.camera, points)).sum(1), 0).astype(np.float32) ** 2
+    weights_squared, weights_sum = np.zeros(len(normal)), np.zeros(len(normal))
+
+    def swept(hand: int) -> tuple[NDArray[np.float32], ...]:
+        """Sums over every WORKERS-th view."""
+        total = np.zeros((len(offsets), len(normal)), np.float32)
+        first, second = np.zeros((*total.shape, 3), np.float32), np.zeros_like(total)
+        for view, photometric, index in list(zip(capture.views, maps, seen, strict=True))[hand::WORKERS]:
+            image = feature_image(photometric, view.mask, view.pixel_index)
+            local, points = normal[index], surface.vertices[index]
+            cosine = _facing(view, points, local)
+            for j, offset in enumerate(offsets):
+                value = _remap(image, project(view.camera, points + offset * local)[0])
+                confidence = value[:, 3]
+                feature = value[:, :3] / np.maximum(confidence, 1e-6)[:, None]
+                weight = cosine * confidence
+                total[j, index] += weight
+                first[j, index] += weight[:, None] * feature
+                second[j, index] += weight * np.einsum("ni,ni->n", feature, feature)
+        return total, first, second
+
+    for view, index in zip(capture.views, seen, strict=True):
+        cosine = _facing(view, surface.vertices[index], normal[index])
         weights_sum[index] += cosine
         weights_squared[index] += cosine**2
-        for j, offset in enumerate(offsets):
-            value = _remap(image, project(view.camera, points + offset * local)[0])
-            confidence = value[:, 3]
-            feature = value[:, :3] / np.maximum(confidence, 1e-6)[:, None]
-            weight = cosine * confidence
-            total[j, index] += weight
-            first[j, index] += weight[:, None] * feature
-            second[j, index] += weight * (feature**2).sum(1)
+    with ThreadPoolExecutor(WORKERS) as pool:
+        total, first, second = (sum(parts) for parts in zip(*pool.map(swept, range(WORKERS)), strict=True))
     mean = first / np.maximum(total, 1e-9)[..., None]
     views = weights_sum**2 / np.maximum(weights_squared, 1e-12)
     # The variance of n samples about their own mean is short of the true one by (n - 1) / n.
@@ -139,10 +157,13 @@ def rotations(source: Float, target: Float) -> Float:
     return rotated
 
 
-def fuse(surface: Surface, target: Float, agreed: Agreement, normal_sigma: float, position_floor: float, sweeps: int = 3) -> Surface:
+def fuse(
+    surface: Surface, target: Float, agreed: Agreement, normal_sigma: float, position_floor: float, factor: CholeskyLike | None = None
+) -> tuple[Surface, CholeskyLike]:
     """The surface moved so that its faces follow `target` (F, 3), unit, and its vertices the agreed positions; same faces.
 
-    normal_sigma radians; position_floor: smallest standard deviation of an agreed position, world units.
+    normal_sigma radians; position_floor: smallest standard deviation of an agreed position, world units. The factor of the system may
+    serve another fusion of a surface that has hardly moved.
     """
     x = surface.vertices
     faces = np.ascontiguousarray(surface.faces)
@@ -166,10 +187,10 @@ def fuse(surface: Surface, target: Float, agreed: Agreement, normal_sigma: float
     y = x
     robust = np.ones(len(x))
     # Reweighting changes the diagonal alone: the first factor stays a good preconditioner.
-    factor = CholeskyLike(L + sp.diags(weight + rest))
-    for _ in range(sweeps):
+    factor = factor or CholeskyLike(L + sp.diags(weight + rest))
+    for _ in range(SWEEPS):
         held = weight * robust
         y = factor.nearby(L + sp.diags(held + rest), right + held[:, None] * agreed_at + rest * x, y)
         away = np.abs(((y - agreed_at) * outward).sum(1))
         robust = 1 / (1 + (away / (FAR_OFF * sigma)) ** 2)
-    return Surface(y, surface.faces)
+    return Surface(y, surface.faces), factor
