@@ -20,6 +20,7 @@ from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.pixels import all_pixel_normals
+from mvps.joint.reflectance import light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
@@ -142,6 +143,17 @@ def _solve_lights(
     return coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
 
 
+def _with_colours(state: State, capture: Capture, few: list[ViewSamples], some: torch.Tensor) -> Lights:
+    """The lights with colours from some vertices."""
+    assert state.vertices is not None
+    chosen = torch.zeros(len(state.vertices.normal), dtype=torch.bool, device=some.device)
+    chosen[some] = True
+    rows = [samples.of_pairs(chosen[samples.vertex].nonzero()[:, 0]) for samples in few]
+    ratios, grey = [channel_ratio(e) for e in state.lights.intensity], grey_lights(state.lights, some.device)
+    ratios = light_ratios(capture, state.surface, rows, state.vertices, grey, state.law, ratios, state.lights.one_rig)
+    return coloured_lights(grey, ratios, state.lights.one_rig)
+
+
 def angle_deg(a: Any, b: Any) -> Float:
     """Degrees between unit vectors (..., 3)."""
     degrees: Float = np.degrees(np.arccos(np.clip((np.asarray(a) * np.asarray(b)).sum(-1), -1, 1)))
@@ -203,12 +215,13 @@ def photometric_round(
     solved = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
     moved = light_change(state.lights, solved)
     state.lights = solved
-    part, part_lights = lit()
-    lights = grey_lights(part_lights, device)
+    lights = grey_lights(lit()[1], device)
     for _ in range(2):
         last = vertices.normal
         vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
+    state.lights = _with_colours(state, capture, few, some)
+    part, part_lights = lit()
     state.maps = all_pixel_normals(part, state.surface, material_of(state, grey_albedo(vertices)), part_lights, _sources(state, vertices))
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))

@@ -19,9 +19,9 @@ from mvps.camera import pixel_footprint
 from mvps.joint.blocks import Vertices
 from mvps.joint.fused import face_targets
 from mvps.joint.observe import channel_ratio, visible_in
-from mvps.joint.photometry import State, Task, coloured_lights, grey_albedo, grey_lights, material_of, photometric_round
+from mvps.joint.photometry import State, Task, grey_albedo, grey_lights, material_of, photometric_round
 from mvps.joint.pixels import OWN_LIGHTS
-from mvps.joint.reflectance import colours
+from mvps.joint.reflectance import coloured_albedo
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.material import Trial
 from mvps.mesh import edges, isotropic_remesh, split_edges, vertex_normals
@@ -170,13 +170,12 @@ def refine(
 
 
 def _finished(state: State, capture: Capture | None, account: list[dict[str, float]], device: torch.device) -> Refined:
-    """The result, with colours from a capture's photographs, or grey without one."""
+    """The result, with albedo in the colours of a capture's photographs, or grey without one."""
     assert state.vertices is not None
     lights, albedo = state.lights, grey_albedo(state.vertices)
     if capture is not None:
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
-        albedo, ratios = colours(capture, state.surface, state.views, state.vertices, grey, state.law, ratios, lights.one_rig)
-        lights = coloured_lights(grey, ratios, lights.one_rig)
+        albedo = coloured_albedo(capture, state.surface, state.views, state.vertices, grey, state.law, ratios)
     material = material_of(state, albedo)
     status, text = _verdict(account)
     return Refined(state.surface, material, lights, state.maps, state.law, state.trials, account, status, text)

@@ -23,7 +23,6 @@ from mvps.joint.observe import ViewSamples
 from mvps.scene import Capture, Float, Law, Surface, View
 
 COLOUR_SWEEPS = 3
-COLOUR_VERTICES = 4000
 PAIRS_PER_CHUNK = 2048
 
 
@@ -71,7 +70,22 @@ def _sums(
     return out
 
 
-def colours(
+def _gathered_sums(
+    capture: Capture,
+    surface: Surface,
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    ratios: list[Float],
+    colour: NDArray[np.float32],
+) -> list[_Sums]:
+    tasks = list(zip(capture.views, views, lights, ratios, strict=True))
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return list(pool.map(lambda t: _sums(t[0], t[1], surface, vertices, t[2], law, t[3].astype(np.float32), colour), tasks))
+
+
+def light_ratios(
     capture: Capture,
     surface: Surface,
     views: list[ViewSamples],
@@ -80,28 +94,35 @@ def colours(
     law: Law,
     ratios: list[Float],
     one_rig: bool,
-) -> tuple[NDArray[np.float64], list[Float]]:
-    """Albedo (V, 3), NaN where no view sees the vertex, and per view the lights' channel ratios (lights, 3). Starts from `ratios`."""
+) -> list[Float]:
+    """Per view the lights' channel ratios (lights, 3), from `ratios` on. The samples of some thousand vertices are enough."""
     colour = np.ones((len(vertices.normal), 3), np.float32)
-
-    def gather(samples: list[ViewSamples], now: NDArray[np.float32]) -> list[_Sums]:
-        tasks = list(zip(capture.views, samples, lights, ratios, strict=True))
-        with ThreadPoolExecutor(WORKERS) as pool:
-            return list(pool.map(lambda t: _sums(t[0], t[1], surface, vertices, t[2], law, t[3].astype(np.float32), now), tasks))
-
-    # Three numbers per light need no more than some of the vertices; whole vertices, because a vertex is seen by several views.
-    stride = max(1, len(colour) // COLOUR_VERTICES)
-    few = [samples.of_pairs((samples.vertex % stride == 0).nonzero()[:, 0]) for samples in views]
     for _ in range(COLOUR_SWEEPS):
-        sums = gather(few, colour)
-        top, bottom = _over_views(few, [(s.colour, s.colour_weight) for s in sums], len(colour))
+        sums = _gathered_sums(capture, surface, views, vertices, lights, law, ratios, colour)
+        top, bottom = _over_views(views, [(s.colour, s.colour_weight) for s in sums], len(colour))
         colour = (top / np.maximum(bottom, 1e-12)[:, None]).astype(np.float32)
-        ratios = _ratios([(s.light, s.light_weight) for s in gather(few, colour)], one_rig)
-    top, bottom = _over_views(views, [(s.albedo, s.albedo_weight) for s in gather(views, colour)], len(colour))
-    albedo = np.full((len(colour), 3), np.nan)
+        sums = _gathered_sums(capture, surface, views, vertices, lights, law, ratios, colour)
+        ratios = _ratios([(s.light, s.light_weight) for s in sums], one_rig)
+    return ratios
+
+
+def coloured_albedo(
+    capture: Capture,
+    surface: Surface,
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    ratios: list[Float],
+) -> NDArray[np.float64]:
+    """Albedo (V, 3) under lights of known channel ratios, NaN where no view sees the vertex."""
+    nothing = np.zeros((len(vertices.normal), 3), np.float32)
+    sums = _gathered_sums(capture, surface, views, vertices, lights, law, ratios, nothing)
+    top, bottom = _over_views(views, [(s.albedo, s.albedo_weight) for s in sums], len(nothing))
+    albedo = np.full(nothing.shape, np.nan)
     known = bottom > 0
     albedo[known] = np.maximum(top[known] / bottom[known, None], 0)
-    return albedo, ratios
+    return albedo
 
 
 def _over_views(views: list[ViewSamples], sums: list[tuple[Float, Float]], vertices: int) -> tuple[Float, Float]:
