@@ -1,6 +1,6 @@
 """Figures per capture: reconstruct through the command line, evaluate, and keep a table.
 
-    python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard]
+    python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard] [--repeats 3]
 
 CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and
 accuracy-PRESET.md beside this file: errors against ground truth (which the reconstruction never reads), seconds of the whole command, and
@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import platform
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -56,17 +57,19 @@ def machine() -> str:
     return f"{model or platform.processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
 
 
-def measure(name: str, captures: Path, preset: str, folder: Path) -> dict[str, Any]:
-    """One row: the figures of one case."""
+def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) -> dict[str, Any]:
+    """One row: the figures of one case; seconds are the median of `repeats` runs."""
     capture, options = captures / CASES[name][0], CASES[name][1]
     one_light = folder / "one-light.json"
     one_light.write_text(json.dumps({f"view_{k:02d}": [1 + 7 * k % 32] for k in range(1, 21)}), encoding="utf-8")
     options = [str(one_light) if option == "ONE_LIGHT" else option for option in options]
     result, figures = folder / name, folder / f"{name}.json"
-    start = time.perf_counter()
-    command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet", *options]
-    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
-    seconds = time.perf_counter() - start
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet", *options]
+        subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+        seconds.append(time.perf_counter() - start)
     command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture), "--json", str(figures)]
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
     metrics = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
@@ -74,7 +77,7 @@ def measure(name: str, captures: Path, preset: str, folder: Path) -> dict[str, A
     return {
         "case": name,
         **metrics["truth"],
-        "seconds": seconds,
+        "seconds": statistics.median(seconds),
         "peak_memory_mb": max(stage["peak_memory_mb"] for stage in stages),
         "status": metrics["status"]["name"],
         "stages": {stage["name"]: stage["seconds"] for stage in stages},
@@ -98,13 +101,14 @@ def main() -> None:
     parser.add_argument("captures", type=Path)
     parser.add_argument("cases", nargs="*", help=" ".join(CASES))
     parser.add_argument("--preset", default="standard")
+    parser.add_argument("--repeats", type=int, default=1, help="runs of each case; the table has the median time")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = [measure(name, given.captures, given.preset, Path(folder)) for name in given.cases or CASES]
+        rows = [measure(name, given.captures, given.preset, Path(folder), given.repeats) for name in given.cases or CASES]
     stem = HERE / f"accuracy-{given.preset}"
     record = {"machine": machine(), "preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    text = f"`python benchmarks/accuracy.py CAPTURES --preset {given.preset}` on {machine()}.\n\n{table(rows)}\n"
+    text = f"`python benchmarks/accuracy.py CAPTURES {' '.join(given.cases)} --preset {given.preset} --repeats {given.repeats}` on {machine()}.\n\n{table(rows)}\n"
     stem.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 

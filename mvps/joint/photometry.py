@@ -129,18 +129,22 @@ def _choose_model(state: State, capture: Capture, few: list[ViewSamples], start:
 
 def _solve_lights(
     state: State, capture: Capture, few: list[ViewSamples], vertices: Vertices, anchor: Anchor, some: torch.Tensor, free_lights: bool
-) -> Lights:
-    """The lights solved on some vertices, which are solved along."""
+) -> tuple[Lights, float]:
+    """The lights solved on some vertices, which are solved along; mean turn of the directions in the last step, deg."""
     few, part, tie = subset(few, vertices, anchor, some)
     rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
     lights = grey_lights(state.lights, some.device)
     free = (free_lights, state.model.grazing, state.model.bounce)
+    before = lights
     for _ in range(LIGHT_STEPS):
+        before = lights
         lights, state.law = light_step(few, part, lights, state.law, tie, rotations, state.lights.one_rig, free)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie)
-    return coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
+    turned = [angle_deg(a.direction.cpu(), b.direction.cpu()) for a, b in zip(before, lights, strict=True)]
+    solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
+    return solved, float(np.concatenate(turned).mean())
 
 
 def _with_colours(state: State, capture: Capture, few: list[ViewSamples], some: torch.Tensor) -> Lights:
@@ -212,7 +216,7 @@ def photometric_round(
     state.views = with_sources(state.views, part_lights)
     few = state.views if part is capture else with_sources(few, state.lights)
     free = with_population(vertices, free)
-    solved = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
+    solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(lit()[1], device)
@@ -224,13 +228,17 @@ def photometric_round(
     part, part_lights = lit()
     state.maps = all_pixel_normals(part, state.surface, material_of(state, grey_albedo(vertices)), part_lights, _sources(state, vertices))
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
-    turned, settling = (angle_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
+    turned, settling = (angle_deg(n.double().cpu()[seen], vertices.normal.double().cpu()[seen]) for n in (before, last))
+    assert vertices.sigma is not None
+    stated = np.degrees(vertices.sigma.cpu().numpy()[seen])
     return {
         "residual": relative_residual(state.views, vertices),
         "light_change_deg": moved[0],
         "intensity_change": moved[1],
         "normal_change_deg": float(np.mean(turned)),
-        "last_step_deg": float(np.mean(settling)),
+        "light_step_deg": light_step,
+        "last_step_deg": float(np.median(settling)),
+        "stated_error_deg": float(np.median(stated)),
         "grazing": state.law.grazing,
         "bounce": state.law.bounce,
     }

@@ -37,8 +37,11 @@ COST_SMOOTHINGS = 2
 FUSIONS = 2
 
 STILL_DEG = 0.25
-"""Mean change of normals in the last Gauss-Newton step, and of lights in the last round, below which they have settled: Gauss-Newton at
-least halves its steps near a minimum, so that all further steps together are no longer than this."""
+"""Mean turn of the lights in their last Gauss-Newton step below which they have settled: near a minimum steps at least halve, so that all
+further ones together are no longer than this."""
+
+STILL = 0.5
+"""The same for the normals' median turn, over their median standard error: further steps are lost in it."""
 
 POOR_FIT = 0.1
 """Relative residual above which the model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy objects."""
@@ -190,13 +193,14 @@ def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:
             f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks"
             " or poses."
         )
-    if max(last["last_step_deg"], last["light_change_deg"]) > STILL_DEG:
+    enough = STILL * last["stated_error_deg"]
+    if last["last_step_deg"] > enough or last["light_step_deg"] > STILL_DEG:
         return "not settled", (
-            f"In the last step normals still turned by {last['last_step_deg']:.2f} deg, in the last round lights by"
-            f" {last['light_change_deg']:.2f} deg (settled below {STILL_DEG} deg); a finer preset does more rounds."
+            f"In the last step normals still turned by {last['last_step_deg']:.2f} deg (settled below {enough:.2f}, half their standard"
+            f" error), lights by {last['light_step_deg']:.2f} deg (settled below {STILL_DEG}); a finer preset does more rounds."
         )
     return "converged", (
         f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last step normals turned by"
-        f" {last['last_step_deg']:.2f} deg, in the last round lights by {last['light_change_deg']:.2f} deg,"
+        f" {last['last_step_deg']:.2f} deg, lights by {last['light_step_deg']:.2f} deg,"
         f" vertices by {last['vertex_change_px']:.2f} px."
     )
