@@ -108,7 +108,8 @@ def main() -> None:
     stem = HERE / f"accuracy-{given.preset}"
     record = {"machine": machine(), "preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    text = f"`python benchmarks/accuracy.py CAPTURES {' '.join(given.cases)} --preset {given.preset} --repeats {given.repeats}` on {machine()}.\n\n{table(rows)}\n"
+    command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset} --repeats {given.repeats}"
+    text = f"`{command}` on {machine()}.\n\n{table(rows)}\n"
     stem.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 

@@ -41,6 +41,7 @@ ROWS = (
     _grouped("normal maps, mean error, degrees", "map_", "normal_error_deg", "{:.2f}"),
     _grouped("normal maps, median error, degrees", "map_", "normal_error_median_deg", "{:.2f}"),
     _grouped("share of the truth that the normal maps cover", "map_", "normal_coverage", "{:.4f}"),
+    Row("normals, stated against measured, largest factor", ("confidence_factor", "", ""), "{:.2f}"),
     Row("light directions, mean error, degrees", ("light_error_deg", "", ""), "{:.2f}"),
     Row("light directions, largest error, degrees", ("light_error_max_deg", "", ""), "{:.2f}"),
     Row("light intensities, mean relative error", ("intensity_error", "", ""), "{:.4f}"),

@@ -9,6 +9,8 @@ F-score          harmonic mean of the shares of both point sets that are nearer 
 Signed offset    mean of +-d(p_result, truth), negative inside: the sign of (p - q) . normal(q).
 Normals          angle(a, b) = 2 atan2(|a - b|, |a + b|) (Kahan), exact for small angles too.
 Lights           one scale for all lights and channels, s = (e . t) / (e . e); error = mean |s e - t| / t (Chen et al. 2019, eq. 8).
+Confidence       pixels by rising stated error in groups of equal number; stated mean angle sqrt(pi / 2) sigma (Rayleigh's distribution,
+                 sigma along either tangent) beside the measured one, and the largest factor between them.
 Photographs      PSNR = mean over images of 10 log10(peak^2 / mean squared error) inside the mask; peak is the radiance at which
                  the camera clips, the rendering is clipped there too; one scale for all images by least squares.
 """
@@ -23,8 +25,13 @@ import numpy as np
 
 from mvps.camera import pixel_footprint
 from mvps.mesh import normalise, vertex_normals
-from mvps.scene import Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
+from mvps.scene import RELIABLE, Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
+
+CONFIDENCE_GROUPS = 10
+
+LEAST_ERROR_DEG = 0.01
+"""Errors below it count as this much: single precision has no finer angles."""
 
 F_SCORE_THRESHOLDS = (0.5, 1.0)
 """Units of the capture (mm): the two thresholds usual for objects the size of a hand."""
@@ -149,6 +156,33 @@ def mesh_normal_errors(surface: Surface, truth: Mapping[str, Float], capture: Ca
     return normal_errors(estimated, truth, capture, held_out)
 
 
+def confidence_errors(surface: Surface, material: Material, truth: Mapping[str, Float], capture: Capture) -> dict[str, float]:
+    """Stated and measured mean error of the material's normals at first hits, deg, in groups, and the largest factor between them.
+
+    truth: view name -> (height, width, 3) true normals, NaN where unknown. No common pixel gives no figures.
+    """
+    caster = RayCaster(surface)
+    stated, measured = [], []
+    for view in capture.views:
+        if view.name not in truth:
+            continue
+        hits, true = camera_hits(caster, view.camera, view.pixels), truth[view.name][view.mask]
+        certain = interpolate(surface, hits, material.confidence)
+        known = np.isfinite(true).all(1) & (hits.face >= 0) & (certain > 0)
+        normal = normalise(interpolate(surface, hits, material.normal)[known])
+        stated.append(np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(np.maximum(1 / certain[known] - 1, 0))))
+        measured.append(angles_deg(normal, true[known]))
+    said, found = (np.concatenate(parts) if parts else np.zeros(0) for parts in (stated, measured))
+    if len(said) < CONFIDENCE_GROUPS:
+        return {}
+    groups = np.array_split(np.argsort(said, kind="stable"), CONFIDENCE_GROUPS)
+    pairs = np.array([(said[group].mean(), found[group].mean()) for group in groups]).clip(LEAST_ERROR_DEG)
+    errors = {"confidence_factor": float(np.exp(np.abs(np.log(pairs[:, 0] / pairs[:, 1])).max()))}
+    for k, (a, b) in enumerate(pairs.tolist(), start=1):
+        errors |= {f"confidence_stated_{k:02d}_deg": a, f"confidence_measured_{k:02d}_deg": b}
+    return errors
+
+
 def by_photograph(lights: Lights, views: Sequence[str], numbers: Sequence[Sequence[int]]) -> dict[Photograph, Light]:
     """The lights of `views`, by the photograph they lit; numbers: per view those of its lights, in the order of `lights`."""
     return {
@@ -250,6 +284,7 @@ def evaluate(reconstruction: Reconstruction, capture: Capture, truth: Truth) -> 
     mapped = Capture(capture.name, tuple(view for view in capture.views if view.name in maps))
     errors |= {f"mesh_{k}": v for k, v in mesh_normal_errors(reconstruction.surface, truth.normals, capture, unseen).items()}
     errors |= {f"map_{k}": v for k, v in normal_errors(maps, truth.normals, mapped, unseen & set(maps)).items()}
+    errors |= confidence_errors(reconstruction.surface, reconstruction.material, truth.normals, capture)
     lights = by_photograph(reconstruction.lights, reconstruction.views, reconstruction.light_names)
     errors |= light_errors(lights, true_lights(truth))
     held_out_lights = held_out_photographs(reconstruction)

@@ -6,8 +6,7 @@ on the grey image, each light's channels divided by their intensities and averag
 left out, samples in attached shadow (n . l <= 0) too, since Lambert's law is not linear there, and samples much darker than the fit
 (cast shadow) or brighter (highlight) are outvoted. Albedo per channel is then the robust ratio of radiance to shading.
 
-Confidence is 1 / (1 + (sigma / unit)^2) with sigma the standard deviation of the normal in radians from the normal equations,
-residual scale included, and the unit RELIABLE.
+Confidence (scene.py) is of the normal's standard deviation from the normal equations, residual scale included.
 """
 
 from __future__ import annotations
@@ -16,14 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import pixel_centres, rays
-from mvps.scene import Float, NormalMap, View
+from mvps.scene import RELIABLE, Float, NormalMap, View
 from solvers.low_rank import robust_weights, solve_rows
 
 SWEEPS = 4
 PIXELS_PER_CHUNK = 4096
-
-RELIABLE = 0.2
-"""Standard deviation of a normal, radians, at which confidence is one half: there a normal no longer tells a slope from flat ground."""
 
 
 def grey(view: View, intensity: Float, part: slice) -> NDArray[np.float64]:

@@ -202,12 +202,18 @@ class Capture:
         return Capture(self.name, tuple(views))
 
 
+RELIABLE = 0.2
+"""Standard deviation of a normal, radians, at which its confidence is one half: there it no longer tells a slope from flat ground.
+
+confidence = 1 / (1 + (sigma / RELIABLE)^2) with sigma the standard deviation along either tangent."""
+
+
 @dataclass(frozen=True, eq=False)
 class NormalMap:
     """Photometric stereo of one view, at its foreground pixels.
 
     normal (pixels, 3) unit, world frame; albedo (pixels, 3) RGB in units of radiance over intensity;
-    confidence (pixels,) in [0, 1], 0 where the pixel could not be solved (its normal then faces the camera).
+    confidence (pixels,) in the normal (RELIABLE), 0 where the pixel could not be solved (its normal then faces the camera).
     """
 
     normal: NDArray[np.float32]
@@ -265,7 +271,7 @@ class Material:
     albedo           (V, 3) RGB
     specular_weight  (V, lobes) or (V, lobes, 3), non-negative
     sharpness        (lobes,) of exp(sharpness * (half . normal - 1)), positive
-    confidence       (V,) in [0, 1]; 0 where no photograph saw the vertex
+    confidence       (V,) in the normal (RELIABLE); 0 where no photograph saw the vertex
     grazing, bounce  as in `Law`
     """
 

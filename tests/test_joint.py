@@ -7,14 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_derivatives, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
-from mvps.joint.observe import observe
+from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights
 from mvps.joint.pixels import all_pixel_normals
-from mvps.joint.steps import free_reflectance, vertex_step
+from mvps.joint.steps import free_reflectance, stated_confidence, vertex_step
 from mvps.joint.vertices import Agreement, agreement, fuse, rotations
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
 from mvps.scene import Law, Material, Surface
@@ -217,3 +219,73 @@ def test_fusing_true_normals_and_positions_mends_a_dented_sphere() -> None:
     mended = fuse(dented, normalise(outward[dented.faces].sum(1)), Agreement(offset, sigma), 0.02, 0.05)[0]
     error = np.abs(np.linalg.norm(mended.vertices, axis=1) - RADIUS)
     assert error.mean() < 0.3 * np.abs(dents).mean()
+
+
+def test_stated_confidence_knows_the_tie_and_the_meshs_own_coarseness() -> None:
+    sigma = torch.tensor([0.02, 0.02, 3.0, torch.inf])
+    flat = torch.tensor([[0.0, 0.0, 1.0]]).repeat(4, 1)
+    pairs = torch.tensor([[0, 1], [1, 2], [2, 3]])
+    vertices = Vertices(flat, torch.ones(4, 1), torch.ones(4), sigma)
+    found = 0.2 * (1 / stated_confidence(vertices, 0.3, pairs) - 1).sqrt()
+    assert torch.allclose(found[:2], torch.tensor(0.02).expand(2), rtol=0.01) and found[2] == pytest.approx(0.3, rel=0.01)
+    assert stated_confidence(vertices, 0.3, pairs)[3] == 0
+    bent = torch.nn.functional.normalize(flat + torch.tensor([[0.0], [0.4], [0.0], [0.0]]) * torch.tensor([1.0, 0, 0]), dim=1)
+    rougher = stated_confidence(replace(vertices, normal=bent), 0.3, pairs)
+    assert (rougher[:3] < stated_confidence(vertices, 0.3, pairs)[:3]).all()
+
+
+DEGENERATE = {
+    "one light": lambda s: replace(s, data=s.data & (torch.arange(s.image.shape[1]) == 0)),
+    "lights in a row": lambda s: replace(s, data=s.data & (torch.arange(s.image.shape[1]) < 2)),
+    "all saturated": lambda s: replace(s, data=torch.zeros_like(s.data)),
+    "black": lambda s: replace(s, image=torch.zeros_like(s.image)),
+}
+
+
+@pytest.mark.parametrize("case", DEGENERATE)
+def test_steps_of_rank_deficient_problems_are_finite(scene: SphereScene, case: str) -> None:
+    """Also of vertices that a single view sees."""
+    views, truth, lights, law = problem(scene)
+    few = [DEGENERATE[case](s) for s in views[:1]]
+    anchor = free_reflectance(truth.normal, 0.3, 3)
+    state = Vertices(truth.normal, truth.reflectance, truth.scale)
+    for _ in range(4):
+        state = vertex_step(few, state, lights[:1], law, anchor)
+        assert all(torch.isfinite(t).all() for t in (state.normal, state.reflectance, state.scale)) and (state.reflectance >= 0).all()
+        assert torch.allclose(state.normal.norm(dim=1), torch.tensor(1.0), atol=1e-5)
+    certain = stated_confidence(state, 0.3, torch.tensor([[0, 1]]))
+    assert torch.isfinite(certain).all() and (certain >= 0).all() and (certain <= 1).all()
+    rotation = [torch.tensor(scene.capture.views[0].camera.rotation, dtype=torch.float32)]
+    stepped, _ = light_step(few, state, lights[:1], law, anchor, rotation, False)
+    assert torch.isfinite(stepped[0].direction).all() and torch.isfinite(stepped[0].intensity).all()
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.0, 0.3), st.floats(0.0, 0.2))
+def test_vertex_steps_never_worsen_random_problems(seed: int, turn: float, noise: float) -> None:
+    """Two dozen vertices of random reflectance under random lights: after a few steps they explain the samples no worse than before."""
+    g = torch.Generator().manual_seed(seed)
+
+    def units(n: int, centre: tuple[float, float, float]) -> torch.Tensor:
+        return torch.nn.functional.normalize(torch.tensor(centre) + 0.6 * torch.randn(n, 3, generator=g), dim=1)
+
+    n, count = 24, 10
+    lights = [DirectionalLights(units(count, (0, 0, 1)), 0.5 + torch.rand(count, generator=g))]
+    normal, towards = units(n, (0, 0, 1.5)), units(n, (0, 0, 3))
+    reflectance = torch.rand(n, 2, generator=g) * torch.tensor([1.0, 0.5])
+    law = Law((20.0,), 0.1, 0.0)
+    image = evaluate(normal, reflectance, towards, lights[0], law).predicted
+    image = (image + noise * image.mean() * torch.randn(n, count, generator=g)).clamp_min(0)
+    samples = [ViewSamples(torch.arange(n), towards, torch.ones(n), image, torch.ones(n, count, dtype=torch.bool))]
+    start = torch.nn.functional.normalize(normal + turn * torch.randn(n, 3, generator=g), dim=1)
+    state = Vertices(start, torch.full((n, 2), 0.3), torch.full((n,), 1.0))
+    anchor = free_reflectance(start, 0.3, 2)
+
+    def worst(at: Vertices) -> float:
+        return float((evaluate(at.normal, at.reflectance, towards, lights[0], law).predicted - image).abs().mean())
+
+    before = worst(state)
+    for _ in range(8):
+        state = vertex_step(samples, state, lights, law, anchor)
+        assert torch.isfinite(state.normal).all() and torch.isfinite(state.reflectance).all()
+    assert worst(state) <= before * 1.01

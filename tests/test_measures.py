@@ -352,3 +352,26 @@ def test_what_the_truth_lacks_is_left_out() -> None:
     made, capture, truth = reconstruction({"hold_out_views": [2]})
     errors = measures.evaluate(made, capture, Truth(truth.views, {}, {}, {}, None))
     assert set(errors) == {"held_out_views_psnr_db", "photograph_scale"}
+
+
+@pytest.mark.parametrize("overconfident", [1.0, 4.0])
+def test_stated_errors_are_held_against_measured_ones(overconfident: float) -> None:
+    """Normals with errors of known spread, stated right, or four times too small."""
+    ball, rng = sphere(25, 5), np.random.default_rng(0)
+    normal = vertex_normals(ball)
+    # A field that is the same at the corners of a face: noise of single vertices would be averaged by the interpolation.
+    sigma = np.radians(2 + 6 * (ball.vertices[:, 2] > 0))
+    phase = 0.05 * rng.normal(size=(3, 64))
+    field = np.cos(ball.vertices @ phase + rng.uniform(0, 2 * np.pi, 64)) @ rng.normal(size=(64, 3)) / np.sqrt(32)
+    tilted = normal + sigma[:, None] * field
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    stated = 1 / (1 + (sigma / overconfident / 0.2) ** 2)
+    material = Material(tilted, np.ones((len(normal), 3)), np.zeros((len(normal), 0)), np.zeros(0), stated)
+    capture = seen(ball, SIX_SIDES)
+    truth = {v.name: measures.mesh_normals(RayCaster(ball), v) for v in capture.views}
+    errors = measures.confidence_errors(ball, material, truth, capture)
+    pairs = [(errors[f"confidence_stated_{k:02d}_deg"], errors[f"confidence_measured_{k:02d}_deg"]) for k in (1, 10)]
+    assert pairs[0][0] == pytest.approx(np.sqrt(np.pi / 2) * 2 / overconfident, rel=0.01)
+    assert pairs[1][0] == pytest.approx(np.sqrt(np.pi / 2) * 8 / overconfident, rel=0.01)
+    assert (errors["confidence_factor"] < 2) == (overconfident == 1)
+    assert measures.confidence_errors(ball, material, {}, capture) == {}

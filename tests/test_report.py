@@ -16,7 +16,8 @@ from sphere_scene import SphereScene, make_sphere
 
 import mvps.report.page
 from mvps.report import report_html, write_report
-from mvps.report.charts import light_sphere, line_chart
+from mvps.report.charts import light_sphere, line_chart, pair_chart
+from mvps.report.page import _truth
 from mvps.report.pictures import ERROR_SPAN, LARGEST_SIDE, view_pictures
 from mvps.scene import Capture, Lights
 from mvps.visibility import RayCaster
@@ -239,3 +240,10 @@ def test_write_is_whole_and_repeatable(scene: SphereScene, html: str, tmp_path: 
     with pytest.raises(KeyboardInterrupt):
         write_report(scene.reconstruction, scene.capture, tmp_path / "report.html")
     assert list(tmp_path.iterdir()) == [tmp_path / "report.html"] and (tmp_path / "report.html").read_text(encoding="utf-8") == html
+
+
+def test_confidence_is_drawn_and_not_listed() -> None:
+    pairs = {f"confidence_{kind}_{k:02d}_deg": k * f for k in (1, 2) for kind, f in (("stated", 1.0), ("measured", 1.5))}
+    html = _truth({"chamfer_mm": 0.2, **pairs})
+    assert html.count("<title>") == 2 and "1, 1.5" in html and "confidence stated" not in html
+    assert not Page(pair_chart([(1.0, 1.0)], "a", "b")).open

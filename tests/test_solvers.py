@@ -1,11 +1,14 @@
 """Solvers: low rank, linear, bounded least squares."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 import torch
 from scipy.optimize import lsq_linear
 
+from solvers.adam import Adam
 from solvers.least_squares import bounded_step
 from solvers.linear import CholeskyLike
 from solvers.low_rank import factorise, robust_weights, solve_rows
@@ -78,3 +81,28 @@ def test_rank_deficient_problems_give_finite_damped_steps(rank: int) -> None:
     H, g = (torch.tensor(a, dtype=torch.float32)[None] for a in (J.T @ J, J.T @ r))
     step = bounded_step(H, g, torch.full((1, 4), -torch.inf))[0]
     assert torch.isfinite(step).all() and step[rank:].abs().max() == 0
+
+
+def test_adam_steps_like_torch_and_only_the_rows_in_use() -> None:
+    generator = torch.Generator().manual_seed(0)
+    table, mine = (torch.randn(40, 3, generator=torch.Generator().manual_seed(1)) for _ in range(2))
+    theirs = torch.optim.Adam([table.requires_grad_()], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    ours = Adam([mine], (0.9, 0.99), 1e-8)
+    with ThreadPoolExecutor(2) as pool:
+        for step in range(6):
+            used = 10 if step < 3 else 40
+            halves = [torch.randn(used, 3, generator=generator) for _ in range(2)]
+            table.grad = torch.zeros_like(table)
+            table.grad[:used] = halves[0] + halves[1]
+            theirs.step()
+            ours.step([halves], [0.1], pool)
+    assert torch.allclose(mine, table.detach(), atol=1e-6)
+
+
+def test_a_factor_serves_a_nearby_matrix() -> None:
+    rng = np.random.default_rng(0)
+    A = sp.csc_matrix(sp.diags([-np.ones(49), 3 * np.ones(50), -np.ones(49)], [-1, 0, 1]))
+    near = sp.csc_matrix(A + sp.diags(rng.uniform(0, 0.5, 50)))
+    x = rng.normal(size=(50, 3))
+    found = CholeskyLike(A).nearby(near, near @ x, np.zeros((50, 3)))
+    assert np.abs(found - x).max() < 1e-5

@@ -145,7 +145,7 @@ def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor,
         g -= half.T @ right
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
     diagonal = torch.diagonal(H).clamp_min(0)
-    H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max())
+    H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max() + torch.finfo(H.dtype).tiny ** 0.5)
     wanted = torch.cat([torch.full((len(g) - OF_LAW,), True), torch.tensor(solved)]).nonzero()[:, 0].to(g.device)
     step = torch.zeros_like(g)
     if len(wanted):

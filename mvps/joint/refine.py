@@ -7,7 +7,7 @@ A round:  remesh -> samples (visibility and shadows traced anew) -> vertices for
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -19,9 +19,10 @@ from mvps.camera import pixel_footprint
 from mvps.joint.blocks import Vertices
 from mvps.joint.fused import face_targets
 from mvps.joint.observe import channel_ratio, visible_in
-from mvps.joint.photometry import State, Task, grey_albedo, grey_lights, material_of, photometric_round
+from mvps.joint.photometry import WEAK_TIE, State, Task, grey_albedo, grey_lights, material_of, photometric_round
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import coloured_albedo
+from mvps.joint.steps import stated_confidence
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.material import Trial
 from mvps.mesh import edges, isotropic_remesh, split_edges, vertex_normals
@@ -179,7 +180,9 @@ def _finished(state: State, capture: Capture | None, account: list[dict[str, flo
     if capture is not None:
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
         albedo = coloured_albedo(capture, state.surface, state.views, state.vertices, grey, state.law, ratios)
-    material = material_of(state, albedo)
+    pairs = torch.from_numpy(edges(state.surface)).to(device)
+    stated = stated_confidence(state.vertices, WEAK_TIE, pairs).double().cpu().numpy()
+    material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0))
     status, text = _verdict(account)
     return Refined(state.surface, material, lights, state.maps, state.law, state.trials, account, status, text)
 

@@ -17,14 +17,11 @@ from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
 from mvps.joint.observe import ViewSamples
-from mvps.scene import Law
+from mvps.scene import RELIABLE, Law
 from solvers.least_squares import bounded_step, columns_of_inverse
 
 LARGEST_TURN = 0.3
 """Radians that a normal or light may turn in one step: the linearisation of n . l and of a lobe's flank ends there."""
-
-RELIABLE = 0.2
-"""Standard deviation of a normal, radians, at which confidence is one half (as in photometric.py)."""
 
 CORRELATED = 6.0
 """Samples that share one error of the model: measured errors of normals are 2 to 3 times what independent samples would give."""
@@ -125,7 +122,27 @@ def _sigma(equations: NormalEquations, vertices: Vertices) -> Tensor:
 
 
 def confidence(vertices: Vertices) -> Tensor:
-    """(V,) confidence in the normals: 1 / (1 + (sigma / RELIABLE)^2); 0 without samples."""
+    """(V,) confidence in the normals (scene.py); 0 without samples."""
     assert vertices.sigma is not None
-    certain: Tensor = 1 / (1 + (vertices.sigma / RELIABLE) ** 2)
+    return _confidence(vertices.sigma)
+
+
+def stated_confidence(vertices: Vertices, tie: float, pairs: Tensor) -> Tensor:
+    """(V,) confidence in the normals as the surface's between the vertices: with the error of the tie (radians) to the mesh's normal that
+    stands in where samples say little, and what the normal does along an edge (pairs (E, 2) of vertices), evenly spread over it:
+
+        sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + mean |n_i - n_j|^2 / 2 / 12
+    """
+    assert vertices.sigma is not None
+    change = (vertices.normal[pairs[:, 0]] - vertices.normal[pairs[:, 1]]).square().sum(1)
+    total, count = torch.zeros_like(vertices.scale), torch.zeros_like(vertices.scale)
+    for end in pairs.T:
+        total.index_add_(0, end, change)
+        count.index_add_(0, end, torch.ones_like(change))
+    variance = 1 / (1 / vertices.sigma.clamp_min(1e-6) ** 2 + 1 / tie**2) + total / count.clamp_min(1) / 24
+    return torch.where(vertices.sigma.isfinite(), _confidence(variance.sqrt()), 0.0)
+
+
+def _confidence(sigma: Tensor) -> Tensor:
+    certain: Tensor = 1 / (1 + (sigma / RELIABLE) ** 2)
     return certain

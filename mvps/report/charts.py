@@ -39,6 +39,36 @@ def line_chart(values: Sequence[float], across: str, up: str) -> str:
     )
 
 
+def pair_chart(pairs: Sequence[tuple[float, float]], across: str, up: str) -> str:
+    """Positive pairs on logarithmic axes, with the diagonal and a band of a factor of two around it."""
+    values = np.log2(np.array(pairs))
+    low, high = float(np.floor(values.min())), float(np.ceil(values.max()) + (values.max() == values.min()))
+    side, base = HEIGHT - BOTTOM - 12, HEIGHT - BOTTOM
+
+    def place(x: float, y: float) -> str:
+        return f"{LEFT + (x - low) / (high - low) * side:.1f},{base - (y - low) / (high - low) * side:.1f}"
+
+    ends = [(max(0, -shift), max(0, shift)) for shift in (1, 0, -1)]
+    lines = "".join(
+        f'<polyline class="{kind}" points="{place(low + x, low + y)} {place(high - y, high - x)}"/>'
+        for kind, (x, y) in zip(("axis", "line", "axis"), ends, strict=True)
+    )
+    dots = "".join(
+        f'<circle cx="{at.split(",")[0]}" cy="{at.split(",")[1]}" r="3.5"><title>{a:.3g}, {b:.3g}</title></circle>'
+        for (a, b), at in zip(pairs, (place(x, y) for x, y in values.tolist()), strict=True)
+    )
+    label = f"{up} against {across}: " + ", ".join(f"{a:.3g} {b:.3g}" for a, b in pairs)
+    return (
+        f'<svg viewBox="0 0 {LEFT + side + 12} {HEIGHT}" role="img" aria-label="{escape(label)}">'
+        f'<path class="axis" d="M{LEFT} 8V{base}H{LEFT + side + 4}"/>'
+        f'<text x="{LEFT - 6}" y="16" text-anchor="end">{2**high:.3g}</text>'
+        f'<text x="{LEFT - 6}" y="{base}" text-anchor="end">{2**low:.3g}</text>'
+        f'<text x="{LEFT + side}" y="{base + 16}" text-anchor="end">{2**high:.3g}</text>'
+        f'<text x="{LEFT + side / 2:.0f}" y="{HEIGHT - 4}" text-anchor="middle">{escape(across)}</text>'
+        f'{lines}<g class="dots">{dots}</g></svg>'
+    )
+
+
 def light_sphere(direction: Float, intensity: Float, numbers: Sequence[int], name: str) -> str:
     """Lights as seen from the camera: direction (lights, 3), x right, y up, z to the camera; areas are intensities (lights, 3).
 

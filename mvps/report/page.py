@@ -11,7 +11,7 @@ from typing import Any
 
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.rendering import light_sources
-from mvps.report.charts import light_sphere, line_chart
+from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
 from mvps.scene import Capture, Reconstruction, View
 from mvps.visibility import RayCaster
@@ -35,6 +35,10 @@ svg{width:100%;max-width:30rem;height:auto;font-size:12px}svg text{fill:currentC
 .light{stroke:#777;stroke-width:1}.sphere{max-width:14rem}
 pre{background:var(--soft);padding:.8em;overflow-x:auto;font-size:.85rem}
 """
+
+
+CALIBRATION = ("confidence_stated_", "confidence_measured_")
+"""Beginnings of the measures that the chart of confidence shows."""
 
 
 def write_report(reconstruction: Reconstruction, capture: Capture, path: Path) -> None:
@@ -194,8 +198,11 @@ def _components(components: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _truth(truth: Mapping[str, Any]) -> str:
-    rows = [(key.replace("_", " "), value) for key, value in truth.items()]
-    return _section("Against ground truth", _table(["measure", "value"], rows)) if rows else ""
+    rows = [(key.replace("_", " "), value) for key, value in truth.items() if not key.startswith(CALIBRATION)]
+    stated, measured = ([value for key, value in truth.items() if key.startswith(part)] for part in CALIBRATION)
+    pairs = [(a, b) for a, b in zip(stated, measured, strict=True) if a > 0 and b > 0]
+    chart = f"<h3>Error of normals, deg: stated and measured</h3>{pair_chart(pairs, 'stated', 'measured')}" if pairs else ""
+    return _section("Against ground truth", _table(["measure", "value"], rows) + chart) if rows else ""
 
 
 def _stages(stages: Sequence[Mapping[str, Any]]) -> str:
