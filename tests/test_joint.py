@@ -202,7 +202,7 @@ def test_views_agree_where_the_surface_is(scene: SphereScene) -> None:
     from mvps.joint.observe import visible_in
 
     seen = [index for index, _ in visible_in(scene.capture, inside)]
-    agreed = agreement(scene.capture, inside, maps, seen, np.arange(-2.0, 2.01, 0.25), 2)
+    agreed = agreement(scene.capture, inside, maps, seen, np.arange(-2.0, 2.01, 0.25))
     told = np.isfinite(agreed.sigma) & (agreed.sigma < 0.5)
     assert told.sum() > 100 and abs(np.median(agreed.offset[told]) - 0.02 * RADIUS) < 0.15
 

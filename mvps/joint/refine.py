@@ -31,10 +31,9 @@ from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, Norm
 NORMAL_SIGMA = 0.03
 """Standard deviation of the views' normals, radians, in the fusion with positions: half of all pixels are better than 1 to 2 degrees."""
 
-POSITION_FLOOR_PIXELS = 0.1
+POSITION_FLOOR_PIXELS = 0.05
 """Smallest standard deviation of an agreed position: neighbouring costs share their pixels, so their agreement looks better than it is."""
 
-COST_SMOOTHINGS = 2
 FUSIONS = 2
 
 STILL_DEG = 0.25
@@ -103,7 +102,7 @@ def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, s
         # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
         agreed = Agreement(np.zeros(len(surface.vertices)), np.full(len(surface.vertices), pixel))
     else:
-        agreed = agreement(capture, surface, state.maps, seen, reach * pixel, COST_SMOOTHINGS)
+        agreed = agreement(capture, surface, state.maps, seen, reach * pixel)
     # Faces turn and move, so that other pixels speak for them: twice.
     factor = None
     for _ in range(FUSIONS):

@@ -1,9 +1,8 @@
 """The geometric block: vertex positions from fused normals and from the agreement of views.
 
 Agreement. A vertex x slides along its normal, x + d n, and every view that sees it reports the albedo-scaled normal b of its photometric
-stereo there. Their weighted variance over the views,  c(d) = sum w |b - mean b|^2 / sum w,  is least where x lies on the surface. With c
-averaged over the vertex's neighbours, the lowest sample and its two neighbours give a parabola, whose foot is the agreed offset and whose
-curvature its standard deviation:  sigma^2 = 2 c_min / (3 n c''),  n views and 3 channels (least squares).
+stereo there. Their weighted variance over the views,  c(d) = sum w |b - mean b|^2 / sum w,  is least where x lies on the surface. The
+lowest sample and its two neighbours give a parabola, whose foot is the agreed offset and whose curvature its standard deviation:  sigma^2 = 2 c_min / (3 n c''),  n views and 3 channels (least squares).
 
 Fusion. Positions y minimise
 
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 
 from mvps.camera import project, view_directions
 from mvps.joint.blocks import WORKERS
-from mvps.mesh import edges, face_areas, face_normals, vertex_normals
+from mvps.mesh import face_areas, face_normals, vertex_normals
 from mvps.scene import Capture, Float, Int, NormalMap, Surface, View
 from solvers.linear import CholeskyLike
 
@@ -75,11 +74,9 @@ def _facing(view: View, points: Float, normal: Float) -> NDArray[np.float32]:
     return squared
 
 
-def agreement(
-    capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Int], offsets: Float, smoothing: int
-) -> Agreement:
+def agreement(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Int], offsets: Float) -> Agreement:
     """Where along its normal each vertex agrees best between views. seen: per view the indices of vertices it sees;
-    offsets (n,) evenly spaced, world units; smoothing: how often costs are averaged over neighbours."""
+    offsets (n,) evenly spaced, world units."""
     normal = vertex_normals(surface)
     weights_squared, weights_sum = np.zeros(len(normal)), np.zeros(len(normal))
 
@@ -113,21 +110,7 @@ def agreement(
     unbias = views / np.maximum(views - 1, 0.5)
     cost = np.maximum(second / np.maximum(total, 1e-9) - (mean**2).sum(-1), 0) * unbias
     known = (total > 0.05 * weights_sum).all(0) & (views >= MINIMUM_VIEWS)
-    return _lowest(_smoothed(surface, cost, known, smoothing), known, offsets, views)
-
-
-def _smoothed(surface: Surface, cost: Float, known: NDArray[np.bool_], times: int) -> Float:
-    """Costs (offsets, V) averaged over the neighbours that are known, `times` times."""
-    pairs = edges(surface)
-    n = cost.shape[1]
-    adjacency = sp.coo_matrix((np.ones(2 * len(pairs)), (np.r_[pairs[:, 0], pairs[:, 1]], np.r_[pairs[:, 1], pairs[:, 0]])), (n, n))
-    average = (adjacency + sp.identity(n)).tocsr() @ sp.diags(known.astype(float))
-    average = sp.diags(1 / np.maximum(np.asarray(average.sum(1))[:, 0], 1e-9)) @ average
-    average = average.astype(np.float32)
-    columns = np.ascontiguousarray(cost.T, dtype=np.float32)
-    for _ in range(times):
-        columns = average @ columns
-    return columns.T
+    return _lowest(cost, known, offsets, views)
 
 
 def _lowest(cost: Float, known: NDArray[np.bool_], offsets: Float, views: Float) -> Agreement:
