@@ -2,7 +2,9 @@
 
 Agreement. A vertex x slides along its normal, x + d n, and every view that sees it reports the albedo-scaled normal b of its photometric
 stereo there. Their weighted variance over the views,  c(d) = sum w |b - mean b|^2 / sum w,  is least where x lies on the surface. The
-lowest sample and its two neighbours give a parabola, whose foot is the agreed offset and whose curvature its standard deviation:  sigma^2 = 2 c_min / (3 n c''),  n views and 3 channels (least squares).
+lowest sample and its two neighbours give a parabola, whose foot is the agreed offset and whose curvature its standard deviation:
+
+    sigma^2 = 2 c_min / (3 n c'')        n views and 3 channels (least squares)
 
 Fusion. Positions y minimise
 
