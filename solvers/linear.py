@@ -1,4 +1,4 @@
-"""Sparse symmetric positive definite systems: factor once, solve many, and nearby ones by preconditioned conjugate gradients.
+"""Sparse symmetric positive definite systems: factor once, solve nearby ones by preconditioned conjugate gradients.
 
 A = P^T L U P by SuperLU in symmetric mode (minimum degree ordering of A + A^T, no pivoting off the diagonal), which for a
 positive definite matrix is as stable as Cholesky's factorisation (Golub and Van Loan 2013, section 4.2).
@@ -25,11 +25,6 @@ class CholeskyLike:
 
     def __init__(self, matrix: sp.spmatrix) -> None:
         self._factor = spl.splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-    def solve(self, right: NDArray[Any]) -> NDArray[np.float64]:
-        """x (n,) or (n, k) with A x = right."""
-        solution: NDArray[np.float64] = self._factor.solve(np.ascontiguousarray(right, dtype=np.float64))
-        return solution
 
     def nearby(self, matrix: sp.spmatrix, right: NDArray[Any], start: NDArray[Any]) -> NDArray[np.float64]:
         """x (n, k) with matrix x = right (n, k) for a matrix near the factored one, from `start` (n, k)."""

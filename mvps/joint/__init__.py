@@ -1,9 +1,16 @@
 """Stage II: lights, normals, reflectance and vertices of an explicit mesh, solved together.
 
 observe.py      what the photographs say about the vertices
+thinned.py      fewer lights of every view
 blocks.py       the image model's derivatives and normal equations
-lights.py       lights with the vertices eliminated; steps of the vertices
+steps.py        steps of the vertices, ties, confidence
+lights.py       lights with the vertices eliminated
+trial.py        held-out errors of a reflectance model
+pixels.py       normals of single views at their pixels
 reflectance.py  colour
+photometry.py   the photometric part of a round
+fused.py        the views' normals together, on vertices and faces
 vertices.py     positions from normals and from the agreement of views
 refine.py       the rounds
+held_out.py     lights of photographs that were kept back
 """
