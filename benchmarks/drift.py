@@ -3,7 +3,8 @@
     python benchmarks/drift.py CAPTURES [bunny armadillo spot buddha] [--rounds 30]
 
 Starts where `standard` starts its joint refinement, after Stage I, and goes on for many more rounds at edges of 2 pixels, one call of
-`refine` a round. Writes drift.json and drift.md beside this file.
+`refine` a round. Writes drift.json and drift.md beside this file, where captures of
+earlier runs stay.
 """
 
 from __future__ import annotations
@@ -76,8 +77,10 @@ def main() -> None:
     parser.add_argument("names", nargs="*", default=["bunny", "armadillo", "spot", "buddha"])
     parser.add_argument("--rounds", type=int, default=30)
     given = parser.parse_args()
-    found = {name: trajectory(given.captures / name, given.rounds) for name in given.names}
-    (HERE / "drift.json").write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    record = HERE / "drift.json"
+    found = json.loads(record.read_text(encoding="utf-8")) if record.exists() else {}
+    found |= {name: trajectory(given.captures / name, given.rounds) for name in given.names}
+    record.write_text(json.dumps(found, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     command = f"python benchmarks/drift.py CAPTURES {' '.join(found)} --rounds {given.rounds}"
     text = f"`{command}`: light deg / intensity % / normal map deg by round.\n\n{table(found)}\n"
     (HERE / "drift.md").write_text(text, encoding="utf-8")
