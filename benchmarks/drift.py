@@ -3,8 +3,7 @@
     python benchmarks/drift.py CAPTURES [bunny armadillo spot buddha] [--rounds 30]
 
 Starts where `standard` starts its joint refinement, after Stage I, and goes on for many more rounds at edges of 2 pixels, one call of
-`refine` a round. Writes drift.json and drift.md beside this file, where captures of
-earlier runs stay.
+`refine` a round. Writes drift.json and drift.md beside this file, where captures of earlier runs stay.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.mesh import normalise
 from mvps.scene import Bool, Camera, Float, Int
 
 DILIGENT_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
@@ -37,8 +38,7 @@ def unproject(camera: Camera, image: Float, depth: Float) -> Float:
 def rays(camera: Camera, image: Float) -> tuple[Float, Float]:
     """Origins (..., 3) (the camera's centre) and unit directions (..., 3) in the world, through image coordinates (..., 2)."""
     homogeneous = np.concatenate([image, np.ones_like(image[..., :1])], -1)
-    direction = homogeneous @ np.linalg.inv(camera.K).T @ camera.rotation
-    direction /= np.sqrt(np.einsum("...i,...i->...", direction, direction))[..., None]
+    direction = normalise(homogeneous @ np.linalg.inv(camera.K).T @ camera.rotation)
     return np.broadcast_to(camera.centre, direction.shape).copy(), direction
 
 
@@ -50,9 +50,7 @@ def pixel_centres(pixels: Int) -> Float:
 
 def view_directions(camera: Camera, points: Float) -> Float:
     """Unit vectors (..., 3), world frame, from points towards the camera."""
-    towards = camera.centre - points
-    unit: Float = towards / np.sqrt(np.einsum("...i,...i->...", towards, towards))[..., None]
-    return unit
+    return normalise(camera.centre - points)
 
 
 def footprint(camera: Camera, points: Float) -> Float:

@@ -24,7 +24,7 @@ import igl
 import numpy as np
 
 from mvps.camera import pixel_footprint
-from mvps.mesh import normalise, vertex_normals
+from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.scene import RELIABLE, Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
 
@@ -41,13 +41,6 @@ Photograph = tuple[str, int]
 
 Light = tuple[Float, Float]
 """Direction (3,), unit, world frame, and RGB intensity (3,)."""
-
-
-def angles_deg(a: Float, b: Float) -> Float:
-    """Angles (...,) in degrees between unit vectors a and b (..., 3)."""
-    chord, sum_ = np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)
-    angle: Float = np.degrees(2 * np.arctan2(chord, sum_))
-    return angle
 
 
 def first_hit_points(surface: Surface, capture: Capture) -> Float:

@@ -1,14 +1,9 @@
-"""Discrete geometry on a triangle mesh (V, F): normals, Laplacian, mass matrix, remeshing, cleaning.
-
-cotangent Laplacian   L_ij = -(cot a_ij + cot b_ij) / 2, rows sum to 0, positive semidefinite (igl.cotmatrix is -L)
-mass matrix           M_ii = a third of the area of the faces around vertex i (barycentric), trace = surface area
-"""
+"""Discrete geometry on a triangle mesh (V, F): normals, areas, angles, edges, remeshing, cleaning."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import igl
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
@@ -33,6 +28,13 @@ def lengths(vectors: Float) -> Float:
     """(...,) lengths of vectors (..., 3); several times faster than numpy's norm, which reduces three numbers at a time."""
     length: Float = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
     return length
+
+
+def angles_deg(a: Float, b: Float) -> Float:
+    """Angles (...,) in degrees between unit vectors a and b (..., 3): 2 atan2(|a - b|, |a + b|) (Kahan), exact for small ones too."""
+    chord, sum_ = lengths(a - b), lengths(a + b)
+    angle: Float = np.degrees(2 * np.arctan2(chord, sum_))
+    return angle
 
 
 def face_normals(surface: Surface) -> Float:
@@ -60,18 +62,6 @@ def vertex_normals(surface: Surface) -> Float:
     flat = np.linalg.norm(total, axis=-1) < 1e-12
     total[flat] = (0, 0, 1)
     return normalise(total)
-
-
-def cotangent_laplacian(surface: Surface) -> sp.csc_matrix:
-    """(V, V) positive semidefinite cotangent Laplacian."""
-    return sp.csc_matrix(-igl.cotmatrix(np.ascontiguousarray(surface.vertices), np.ascontiguousarray(surface.faces)))
-
-
-def mass_matrix(surface: Surface) -> sp.csc_matrix:
-    """(V, V) diagonal of vertex areas."""
-    return sp.csc_matrix(
-        igl.massmatrix(np.ascontiguousarray(surface.vertices), np.ascontiguousarray(surface.faces), igl.MASSMATRIX_TYPE_BARYCENTRIC)
-    )
 
 
 def edges(surface: Surface) -> Int:

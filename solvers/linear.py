@@ -27,7 +27,7 @@ class CholeskyLike:
         self._factor = spl.splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
     def nearby(self, matrix: sp.spmatrix, right: NDArray[Any], start: NDArray[Any]) -> NDArray[np.float64]:
-        """x (n, k) with matrix x = right (n, k) for a matrix near the factored one, from `start` (n, k)."""
+        """x (n, k) with matrix x = right (n, k) for a matrix near the factored one, from `start` (n, k); one too far is factored."""
         x = np.array(start, dtype=np.float64)
         residual = right - matrix @ x
         enough = TOLERANCE**2 * (right**2).sum(0)
@@ -44,4 +44,7 @@ class CholeskyLike:
             x += length * direction
             residual -= length * image
             before = np.maximum(now, np.finfo(np.float64).tiny)
+        else:
+            # Not so near after all: the matrix's own factor.
+            x = CholeskyLike(matrix)._factor.solve(np.ascontiguousarray(right, dtype=np.float64))
         return x

@@ -17,9 +17,10 @@ from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.steps import free_reflectance, stated_confidence, vertex_step
+from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import Agreement, agreement, fuse, rotations
 from mvps.mesh import isotropic_remesh, normalise, vertex_normals
-from mvps.scene import Law, Material, Surface
+from mvps.scene import Capture, Law, Lights, Material, Surface
 
 CPU = torch.device("cpu")
 
@@ -281,11 +282,31 @@ def test_vertex_steps_never_worsen_random_problems(seed: int, turn: float, noise
     state = Vertices(start, torch.full((n, 2), 0.3), torch.full((n,), 1.0))
     anchor = free_reflectance(start, 0.3, 2)
 
-    def worst(at: Vertices) -> float:
+    def error(at: Vertices) -> float:
         return float((evaluate(at.normal, at.reflectance, towards, lights[0], law).predicted - image).abs().mean())
 
-    before = worst(state)
+    before = error(state)
     for _ in range(8):
         state = vertex_step(samples, state, lights, law, anchor)
         assert torch.isfinite(state.normal).all() and torch.isfinite(state.reflectance).all()
-    assert worst(state) <= before * 1.01
+    assert error(state) <= before * 1.01
+
+
+def test_thinned_views_keep_other_lights_and_their_own_light(scene: SphereScene) -> None:
+    """A few views keep all of their lights; many views, or very many lights, do with fewer, and all together still use every light."""
+    capture, lights = scene.capture, scene.reconstruction.lights
+    assert thinned(capture, lights) == (capture, lights)
+    view, count = capture.views[0], len(capture.views[0].lights)
+    times = -(-4 * ENOUGH_LIGHTS // count)
+    many = replace(view, samples=np.tile(view.samples, (1, times, 1)), lights=tuple(range(1, times * count + 1)))
+    crowd = Capture("crowd", tuple(replace(many, name=f"view_{k:02d}") for k in range(1, 22)))
+    direction, intensity = (np.tile(values[0], (times, 1)) for values in (lights.direction, lights.intensity))
+    numbered = intensity * np.arange(1, len(intensity) + 1)[:, None]
+    part, kept = thinned(crowd, Lights((direction,) * 21, (numbered,) * 21, True))
+    sizes = [len(v.lights) for v in part.views]
+    assert min(sizes) >= ENOUGH_LIGHTS and max(sizes) < len(many.lights) and sum(sizes) >= ENOUGH_PHOTOGRAPHS
+    assert {number for v in part.views for number in v.lights} == set(many.lights)
+    for v, d, e in zip(part.views, kept.direction, kept.intensity, strict=True):
+        rows = np.array(v.lights) - 1
+        assert np.array_equal(d, direction[rows]) and np.array_equal(e, numbered[rows])
+        assert np.array_equal(v.samples, many.samples[:, rows])

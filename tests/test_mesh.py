@@ -19,21 +19,8 @@ def sheet(n: int = 8) -> Surface:
     return Surface(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1), faces)
 
 
-def test_laplacian_is_symmetric_positive_semidefinite_and_kills_constants() -> None:
-    L = mesh.cotangent_laplacian(sphere(2)).toarray()
-    assert np.allclose(L, L.T) and np.allclose(L.sum(1), 0, atol=1e-10) and np.linalg.eigvalsh(L)[0] > -1e-9
-
-
-def test_laplacian_of_a_linear_function_vanishes_inside_a_flat_sheet() -> None:
-    flat = sheet()
-    inside = ((flat.vertices[:, :2] > 0) & (flat.vertices[:, :2] < 7)).all(1)
-    values = mesh.cotangent_laplacian(flat) @ (3 * flat.vertices[:, 0] - flat.vertices[:, 1])
-    assert np.abs(values[inside]).max() < 1e-12 < np.abs(values).max()
-
-
-def test_mass_sums_to_the_area() -> None:
+def test_areas_of_a_sphere_sum_to_its_area() -> None:
     ball = sphere()
-    assert np.isclose(mesh.mass_matrix(ball).diagonal().sum(), mesh.face_areas(ball).sum())
     assert np.isclose(mesh.face_areas(ball).sum(), 4 * np.pi * 4, rtol=0.01)
 
 

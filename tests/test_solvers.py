@@ -107,3 +107,11 @@ def test_a_factor_serves_a_nearby_matrix() -> None:
     x = rng.normal(size=(50, 3))
     found = CholeskyLike(A).nearby(near, near @ x, np.zeros((50, 3)))
     assert np.abs(found - x).max() < 1e-5
+
+
+def test_a_matrix_that_is_not_near_is_solved_all_the_same() -> None:
+    rng = np.random.default_rng(0)
+    A = sp.csc_matrix(sp.identity(400))
+    far = sp.csc_matrix(sp.diags([-np.ones(399), 2.0001 * np.ones(400), -np.ones(399)], [-1, 0, 1]))
+    x = rng.normal(size=(400, 2))
+    assert np.allclose(CholeskyLike(A).nearby(far, far @ x, np.zeros((400, 2))), x, atol=1e-6)

@@ -20,12 +20,12 @@ from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.pixels import all_pixel_normals
-from mvps.joint.reflectance import light_ratios
+from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, candidates, choose
-from mvps.mesh import mean_edge_length, normalise, vertex_normals
+from mvps.mesh import angles_deg, mean_edge_length, normalise, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 
 SHARPNESS = (8.0, 32.0, 128.0)
@@ -142,7 +142,7 @@ def _solve_lights(
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie)
-    turned = [angle_deg(a.direction.cpu(), b.direction.cpu()) for a, b in zip(before, lights, strict=True)]
+    turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
     return solved, float(np.concatenate(turned).mean())
 
@@ -154,19 +154,13 @@ def _with_colours(state: State, capture: Capture, few: list[ViewSamples], some: 
     chosen[some] = True
     rows = [samples.of_pairs(chosen[samples.vertex].nonzero()[:, 0]) for samples in few]
     ratios, grey = [channel_ratio(e) for e in state.lights.intensity], grey_lights(state.lights, some.device)
-    ratios = light_ratios(capture, state.surface, rows, state.vertices, grey, state.law, ratios, state.lights.one_rig)
+    ratios = light_ratios(Observed(capture, state.surface, rows, state.vertices, grey, state.law), ratios, state.lights.one_rig)
     return coloured_lights(grey, ratios, state.lights.one_rig)
-
-
-def angle_deg(a: Any, b: Any) -> Float:
-    """Degrees between unit vectors (..., 3)."""
-    degrees: Float = np.degrees(np.arccos(np.clip((np.asarray(a) * np.asarray(b)).sum(-1), -1, 1)))
-    return degrees
 
 
 def light_change(a: Lights, b: Lights) -> tuple[float, float]:
     """Mean change of directions (deg) and of intensities (relative)."""
-    turned = np.concatenate([angle_deg(p, q) for p, q in zip(a.direction, b.direction, strict=True)])
+    turned = np.concatenate([angles_deg(p, q) for p, q in zip(a.direction, b.direction, strict=True)])
     before, after = np.concatenate(a.intensity), np.concatenate(b.intensity)
     return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
 
@@ -228,7 +222,7 @@ def photometric_round(
     part, part_lights = lit()
     state.maps = all_pixel_normals(part, state.surface, material_of(state, grey_albedo(vertices)), part_lights, _sources(state, vertices))
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
-    turned, settling = (angle_deg(n.double().cpu()[seen], vertices.normal.double().cpu()[seen]) for n in (before, last))
+    turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None
     stated = np.degrees(vertices.sigma.cpu().numpy()[seen])
     return {

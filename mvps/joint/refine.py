@@ -21,7 +21,7 @@ from mvps.joint.fused import face_targets
 from mvps.joint.observe import channel_ratio, visible_in
 from mvps.joint.photometry import WEAK_TIE, State, Task, grey_albedo, grey_lights, material_of, photometric_round
 from mvps.joint.pixels import OWN_LIGHTS
-from mvps.joint.reflectance import coloured_albedo
+from mvps.joint.reflectance import Observed, coloured_albedo
 from mvps.joint.steps import stated_confidence
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.material import Trial
@@ -178,7 +178,7 @@ def _finished(state: State, capture: Capture | None, account: list[dict[str, flo
     lights, albedo = state.lights, grey_albedo(state.vertices)
     if capture is not None:
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
-        albedo = coloured_albedo(capture, state.surface, state.views, state.vertices, grey, state.law, ratios)
+        albedo = coloured_albedo(Observed(capture, state.surface, state.views, state.vertices, grey, state.law), ratios)
     pairs = torch.from_numpy(edges(state.surface)).to(device)
     stated = stated_confidence(state.vertices, WEAK_TIE, pairs).double().cpu().numpy()
     material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0))

@@ -20,10 +20,21 @@ from numpy.typing import NDArray
 from mvps.camera import bilinear, project
 from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, evaluate, robust
 from mvps.joint.observe import ViewSamples
-from mvps.scene import Capture, Float, Law, Surface, View
+from mvps.scene import Capture, Float, Law, Surface
 
 COLOUR_SWEEPS = 3
 PAIRS_PER_CHUNK = 2048
+
+
+class Observed(NamedTuple):
+    """Photographs, the samples of vertices in their views, and all that predicts these but colour; lights and samples per view."""
+
+    capture: Capture
+    surface: Surface
+    views: list[ViewSamples]
+    vertices: Vertices
+    lights: list[DirectionalLights]
+    law: Law
 
 
 class _Sums(NamedTuple):
@@ -37,28 +48,21 @@ class _Sums(NamedTuple):
     light_weight: Float
 
 
-def _sums(
-    view: View,
-    samples: ViewSamples,
-    surface: Surface,
-    vertices: Vertices,
-    lights: DirectionalLights,
-    law: Law,
-    ratio: NDArray[np.float32],
-    colour: NDArray[np.float32],
-) -> _Sums:
+def _sums(of: Observed, i: int, ratio: NDArray[np.float32], colour: NDArray[np.float32]) -> _Sums:
+    """Those of view i."""
+    view, samples, vertices, lights = of.capture.views[i], of.views[i], of.vertices, of.lights[i]
     n, count = len(samples.vertex), len(ratio)
     out = _Sums(np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((count, 3)), np.zeros((count, 3)))
     for start in range(0, n, PAIRS_PER_CHUNK):
         part = slice(start, start + PAIRS_PER_CHUNK)
         index, towards = samples.vertex[part], samples.towards[part]
-        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, law, samples.gathered_of(part))
+        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, of.law, samples.gathered_of(part))
         weight = samples.weight[part, None] * samples.data[part] * robust(shaded.predicted - samples.image[part], vertices.scale[index])
         w, q, predicted = (t.cpu().numpy() for t in (weight, shaded.basis[0], shaded.predicted))
         diffuse = q * vertices.reflectance[index, :1].cpu().numpy()
         body = w * (diffuse / np.maximum(predicted, 1e-12)) ** 2
         rows = index.cpu().numpy()
-        positions, weights = bilinear(view.pixel_index, project(view.camera, surface.vertices[rows])[0])
+        positions, weights = bilinear(view.pixel_index, project(view.camera, of.surface.vertices[rows])[0])
         image = np.einsum("pklc,pk->plc", view.samples[positions].astype(np.float32) * np.float32(view.scale), weights)
         white = image / ratio
         out.colour[part] = np.einsum("pl,plc->pc", body * predicted, white)
@@ -70,55 +74,27 @@ def _sums(
     return out
 
 
-def _gathered_sums(
-    capture: Capture,
-    surface: Surface,
-    views: list[ViewSamples],
-    vertices: Vertices,
-    lights: list[DirectionalLights],
-    law: Law,
-    ratios: list[Float],
-    colour: NDArray[np.float32],
-) -> list[_Sums]:
-    tasks = list(zip(capture.views, views, lights, ratios, strict=True))
+def _all_sums(of: Observed, ratios: list[Float], colour: NDArray[np.float32]) -> list[_Sums]:
     with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(lambda t: _sums(t[0], t[1], surface, vertices, t[2], law, t[3].astype(np.float32), colour), tasks))
+        return list(pool.map(lambda i: _sums(of, i, ratios[i].astype(np.float32), colour), range(len(of.views))))
 
 
-def light_ratios(
-    capture: Capture,
-    surface: Surface,
-    views: list[ViewSamples],
-    vertices: Vertices,
-    lights: list[DirectionalLights],
-    law: Law,
-    ratios: list[Float],
-    one_rig: bool,
-) -> list[Float]:
+def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:
     """Per view the lights' channel ratios (lights, 3), from `ratios` on. The samples of some thousand vertices are enough."""
-    colour = np.ones((len(vertices.normal), 3), np.float32)
+    colour = np.ones((len(of.vertices.normal), 3), np.float32)
     for _ in range(COLOUR_SWEEPS):
-        sums = _gathered_sums(capture, surface, views, vertices, lights, law, ratios, colour)
-        top, bottom = _over_views(views, [(s.colour, s.colour_weight) for s in sums], len(colour))
+        sums = _all_sums(of, ratios, colour)
+        top, bottom = _over_views(of.views, [(s.colour, s.colour_weight) for s in sums], len(colour))
         colour = (top / np.maximum(bottom, 1e-12)[:, None]).astype(np.float32)
-        sums = _gathered_sums(capture, surface, views, vertices, lights, law, ratios, colour)
-        ratios = _ratios([(s.light, s.light_weight) for s in sums], one_rig)
+        ratios = _ratios([(s.light, s.light_weight) for s in _all_sums(of, ratios, colour)], one_rig)
     return ratios
 
 
-def coloured_albedo(
-    capture: Capture,
-    surface: Surface,
-    views: list[ViewSamples],
-    vertices: Vertices,
-    lights: list[DirectionalLights],
-    law: Law,
-    ratios: list[Float],
-) -> NDArray[np.float64]:
+def coloured_albedo(of: Observed, ratios: list[Float]) -> NDArray[np.float64]:
     """Albedo (V, 3) under lights of known channel ratios, NaN where no view sees the vertex."""
-    nothing = np.zeros((len(vertices.normal), 3), np.float32)
-    sums = _gathered_sums(capture, surface, views, vertices, lights, law, ratios, nothing)
-    top, bottom = _over_views(views, [(s.albedo, s.albedo_weight) for s in sums], len(nothing))
+    nothing = np.zeros((len(of.vertices.normal), 3), np.float32)
+    sums = _all_sums(of, ratios, nothing)
+    top, bottom = _over_views(of.views, [(s.albedo, s.albedo_weight) for s in sums], len(nothing))
     albedo = np.full(nothing.shape, np.nan)
     known = bottom > 0
     albedo[known] = np.maximum(top[known] / bottom[known, None], 0)
