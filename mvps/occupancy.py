@@ -66,6 +66,7 @@ class OccupancySettings:
     ring: half-width in pixels of the ring around the silhouette; normal, colour, mask, smooth: weights of the losses
     outlier: |difference| of unit normals or relative colours at which a pixel counts as an outlier
     grid_rate, network_rate: Adam's; voxel: of the extracted surface
+    strides: every so many pixels take part, one after the other
     """
 
     steps: int = 250
@@ -89,6 +90,11 @@ class OccupancySettings:
     grid_rate: float = 0.1
     network_rate: float = 0.02
     voxel: float = 1.25
+    strides: tuple[int, ...] = (4, 2, 1)
+
+
+CONTINUED = OccupancySettings(steps=150, band=(4.0, 2.0), width=(1.0, 0.5), step=(1.0, 1.0), outlier=(0.5, 0.5), strides=(2, 1))
+"""For a field that other normal maps have trained already: its surface is off by the last band at most, so all starts where that ended."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,14 +150,22 @@ class _Training:
     """The field, its rays with the surface's distance last seen along each, the optimiser, and the threads that share the work."""
 
     def __init__(
-        self, field: OccupancyField, frame: _Frame, data: FieldRays, ring: FieldRays, settings: OccupancySettings, seed: int
+        self,
+        field: OccupancyField,
+        frame: _Frame,
+        data: FieldRays,
+        ring: FieldRays,
+        settings: OccupancySettings,
+        generator: torch.Generator,
+        trained: bool,
     ) -> None:
         self.field, self.frame, self.data, self.ring, self.settings = field, frame, data, ring, settings
-        self.generator = torch.Generator().manual_seed(seed)
+        self.generator = generator
         self.pool_of_threads = ThreadPoolExecutor(PARTS)
         self.seen = torch.zeros(len(data.anchor))
         self.ring_seen = torch.zeros(len(ring.anchor))
         self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long)
+        self.trained = trained
         self.small = [field.first, field.first_bias, field.last, field.last_bias]
         # A tiny epsilon: a node's gradients are small only because few rays pass it.
         self.optimiser = Adam([field.features, *self.small], betas=(0.9, 0.99), epsilon=1e-12)
@@ -236,14 +250,14 @@ class _Training:
         return sum(loss for loss, *_ in parts)
 
     def run(self, on_step: Callable[[int, float], None]) -> None:
-        """All steps: every 4th, then 2nd, then each pixel; grids from coarse to fine; rates that rise shortly and fall to a 20th."""
+        """All steps: ever more of the pixels; grids from coarse to fine; rates that rise shortly and fall to a 20th."""
         s = self.settings
-        strides = (4, 2, 1)
         for k in range(s.steps):
             progress = k / s.steps
-            if k == 0 or int(progress * len(strides)) != int((k - 1) / s.steps * len(strides)):
-                self.widen(strides[int(progress * len(strides))])
-            self.field.activate(max(2, min(s.levels, 2 + int(progress / 0.6 * (s.levels - 1)))))
+            if k == 0 or int(progress * len(s.strides)) != int((k - 1) / s.steps * len(s.strides)):
+                self.widen(s.strides[int(progress * len(s.strides))])
+            coarse_to_fine = max(2, min(s.levels, 2 + int(progress / 0.6 * (s.levels - 1))))
+            self.field.activate(s.levels if self.trained else coarse_to_fine)
             band, width, step, outlier = (_between(pair, 1.5 * progress) for pair in (s.band, s.width, s.step, s.outlier))
             rate = min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
             on_step(k, self.step(band, width, step, outlier, rate))
@@ -274,27 +288,29 @@ def _field(grid: SignedDistanceGrid, frame: _Frame, settings: OccupancySettings,
     )
 
 
-def occupancy_field(
-    capture: Capture,
-    hull_grid: SignedDistanceGrid,
-    normal_maps: tuple[NormalMap, ...],
-    settings: OccupancySettings,
-    seed: int,
-    on_step: Callable[[int, float], None],
-) -> Surface:
-    """The surface of the field trained on a capture's masks and normal maps, started at the visual hull; world units.
+class Occupancy:
+    """The field of a capture, started at its visual hull. Normal maps train it: once, and again when better ones are known."""
 
-    on_step(step from 0, loss) is called after every step. The same seed gives the same surface.
-    """
-    torch.set_num_threads(1)
-    frame = _frame(capture, hull_grid)
-    field = _field(hull_grid, frame, settings, seed)
-    data = foreground_rays(capture, normal_maps, frame.centre, frame.unit)
-    ring = ring_rays(capture, frame.centre, frame.unit, settings.ring)
-    training = _Training(field, frame, data, ring, settings, seed)
-    with training.pool_of_threads:
-        training.run(on_step)
-    return extract(field, frame.low, frame.high, settings.voxel, frame.centre, frame.unit)
+    def __init__(self, capture: Capture, hull_grid: SignedDistanceGrid, settings: OccupancySettings, seed: int) -> None:
+        self._capture, self._frame = capture, _frame(capture, hull_grid)
+        self._field = _field(hull_grid, self._frame, settings, seed)
+        self._generator = torch.Generator().manual_seed(seed)
+        self._trained = False
+
+    def trained(self, normal_maps: tuple[NormalMap, ...], settings: OccupancySettings, on_step: Callable[[int, float], None]) -> Surface:
+        """The field's surface after training on the capture's masks and normal maps; world units.
+
+        on_step(step from 0, loss) is called after every step. The same seed and calls give the same surface.
+        """
+        torch.set_num_threads(1)
+        frame = self._frame
+        data = foreground_rays(self._capture, normal_maps, frame.centre, frame.unit)
+        ring = ring_rays(self._capture, frame.centre, frame.unit, settings.ring)
+        training = _Training(self._field, frame, data, ring, settings, self._generator, self._trained)
+        with training.pool_of_threads:
+            training.run(on_step)
+        self._trained = True
+        return extract(self._field, frame.low, frame.high, settings.voxel, frame.centre, frame.unit)
 
 
 @torch.no_grad()

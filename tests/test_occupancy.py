@@ -13,7 +13,7 @@ from mvps.field import Interpolation, gradient, lattice
 from mvps.fieldrays import ring_pixels
 from mvps.hull import default_cells, signed_distance
 from mvps.mesh import is_closed, normalise, signed_volume
-from mvps.occupancy import OccupancySettings, composite, crossing, occupancy_field
+from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings, composite, crossing
 from mvps.scene import Camera, Capture, NormalMap, Surface
 
 QUICK = OccupancySettings(steps=120, rays=512, ring_rays=256)
@@ -84,7 +84,7 @@ def exact_maps(capture: Capture, unit: float = 1.0) -> tuple[NormalMap, ...]:
 
 
 def run(capture: Capture, maps: tuple[NormalMap, ...], seed: int = 0) -> Surface:
-    return occupancy_field(capture, signed_distance(capture, default_cells(capture)), maps, QUICK, seed, lambda _, __: None)
+    return Occupancy(capture, signed_distance(capture, default_cells(capture)), QUICK, seed).trained(maps, QUICK, lambda _, __: None)
 
 
 @pytest.fixture(scope="module")
@@ -126,3 +126,17 @@ def test_the_unit_of_length_does_not_matter(scene: SphereScene, ball: Surface, u
     radius = np.linalg.norm(run(capture, exact_maps(capture, unit)).vertices / unit, axis=1)
     # Rounding differs between units, and training follows it; the figures may not.
     assert abs(np.median(radius) - np.median(np.linalg.norm(ball.vertices, axis=1))) < 0.1 * PIXEL
+
+
+def test_a_field_trained_on_wrong_normals_recovers_when_trained_again(scene: SphereScene, ball: Surface) -> None:
+    """Normals that all lean by 20 degrees put the surface off; better ones bring it back without starting from the hull."""
+    exact = exact_maps(scene.capture)
+    leaning = tuple(replace(maps, normal=normalise(maps.normal + np.float32([0, 0, 0.36]))) for maps in exact)
+    field = Occupancy(scene.capture, signed_distance(scene.capture, default_cells(scene.capture)), QUICK, 0)
+
+    def error(surface: Surface) -> float:
+        return float(np.abs(np.linalg.norm(surface.vertices, axis=1) - RADIUS).mean() / PIXEL)
+
+    before = error(field.trained(leaning, QUICK, lambda _, __: None))
+    after = error(field.trained(exact, replace(CONTINUED, rays=512, ring_rays=256), lambda _, __: None))
+    assert after < 0.5 * before and after < 0.6

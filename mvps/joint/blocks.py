@@ -78,6 +78,10 @@ class DirectionalLights:
     direction: Tensor
     intensity: Tensor
 
+    def of(self, rows: slice) -> DirectionalLights:
+        """Only some of them."""
+        return DirectionalLights(self.direction[rows], self.intensity[rows])
+
 
 @dataclass(frozen=True)
 class Shaded:

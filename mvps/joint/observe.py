@@ -63,6 +63,12 @@ class ViewSamples:
         gathered = None if self.gathered is None else self.gathered[rows]
         return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered)
 
+    def of_lights(self, rows: slice) -> ViewSamples:
+        """Only some of the lights."""
+        image, data, gathered = (None if a is None else a[:, rows].contiguous() for a in (self.image, self.data, self.gathered))
+        assert image is not None and data is not None
+        return ViewSamples(self.vertex, self.towards, self.weight, image, data, gathered)
+
     def chunks(self) -> Iterator[slice]:
         """Slices of the pairs that hold about SAMPLES_PER_CHUNK samples."""
         step = max(1, SAMPLES_PER_CHUNK // max(1, self.image.shape[1]))

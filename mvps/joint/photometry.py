@@ -21,7 +21,7 @@ from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
-from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, with_population
+from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, candidates, choose
@@ -205,8 +205,7 @@ def photometric_round(
         vertices = replace(vertices, reflectance=vertices.reflectance[:, : 1 + len(state.law.sharpness)])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights = vertices.normal, grey_lights(part_lights, device)
-    for _ in range(MATERIAL_STEPS if carried is None else CARRIED_STEPS):
-        vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS, 0)
     state.views = with_sources(state.views, part_lights)
     few = state.views if part is capture else with_sources(few, state.lights)
     free = with_population(vertices, free)
@@ -214,9 +213,9 @@ def photometric_round(
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(lit()[1], device)
-    for _ in range(2):
-        last = vertices.normal
-        vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, 1, 0)
+    last = vertices.normal
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, 0, 1)
     state.vertices = vertices
     state.lights = _with_colours(state, capture, few, some)
     part, part_lights = lit()

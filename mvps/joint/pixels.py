@@ -20,6 +20,7 @@ from mvps.camera import view_directions
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_step
+from mvps.joint.thinned import kept
 from mvps.mesh import normalise
 from mvps.rendering import Points, points_under, shadow_at
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
@@ -33,7 +34,7 @@ ALBEDO_TIE, WEIGHT_TIE = 0.3, 0.05
 """Standard deviation of a pixel's albedo over the vertices' albedo, and of a lobe's weight over albedo plus weight. Albedo has edges that a
 mesh blurs; one view's lights hardly tell a lobe from a turned normal, so lobes keep close to what all views say."""
 
-STEPS = 3
+QUICK_STEPS, FULL_STEPS = 2, 1
 
 OWN_LIGHTS = 4
 """Lights of a view from which its pixels say something of their own: albedo and two angles of a normal are three unknowns."""
@@ -61,10 +62,12 @@ def pixel_normals(
     material: Material,
     direction: Float,
     intensity: Float,
+    quick: slice,
 ) -> NormalMap:
     """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
 
-    sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3).
+    sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3);
+    quick: lights of the first steps.
     """
     points = points_under(caster, material, view.camera, view.pixels)
     hit = np.flatnonzero(points.hit)
@@ -78,7 +81,10 @@ def pixel_normals(
     anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
     lights = [DirectionalLights(light, torch.tensor(intensity.mean(1), dtype=torch.float32))]
     state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
-    for _ in range(STEPS):
+    some, of_some = [samples.of_lights(quick)], [lights[0].of(quick)]
+    for _ in range(QUICK_STEPS):
+        state = vertex_step(some, state, of_some, material.law, anchor)
+    for _ in range(FULL_STEPS):
         state = vertex_step([samples], state, lights, material.law, anchor)
     towards = -view.camera.rotation[2].astype(np.float32)
     pixels = len(points.hit)
@@ -99,5 +105,5 @@ def all_pixel_normals(
     """`pixel_normals` of every view, on all cores."""
     caster = RayCaster(surface)
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        tasks = zip(capture.views, lights.direction, lights.intensity, strict=True)
-        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, task[1], task[2]), tasks))
+        tasks = zip(capture.views, lights.direction, lights.intensity, kept([len(view.lights) for view in capture.views]), strict=True)
+        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, *task[1:]), tasks))

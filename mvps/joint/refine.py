@@ -87,6 +87,7 @@ class Refined:
     rounds: list[dict[str, float]]
     status: str
     text: str
+    carried: tuple[Surface, Vertices] | None = None
 
 
 def chosen_device(device: str) -> str:
@@ -138,6 +139,7 @@ def refine(
     seed: int,
     device: str,
     on_round: Callable[[int, dict[str, float]], None],
+    carried: tuple[Surface, Vertices] | None = None,
 ) -> Refined:
     """Stage II from a rough surface, lights and the views' photometric stereo under these lights.
 
@@ -148,7 +150,6 @@ def refine(
     torch.set_num_threads(1)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
     state = State(surface, lights, maps, law)
-    carried: tuple[Surface, Vertices] | None = None
     account: list[dict[str, float]] = []
     for number, (before, round_settings) in enumerate(pairwise((None, *settings.rounds)), start=1):
         assert round_settings is not None
@@ -169,7 +170,7 @@ def refine(
             carried = (moved, state.vertices)
         account.append({"round": float(number), "vertices": float(len(shift)), **changes})
         on_round(number, account[-1])
-    return _finished(state, capture if settings.final else None, account, on)
+    return replace(_finished(state, capture if settings.final else None, account, on), carried=carried)
 
 
 def _finished(state: State, capture: Capture | None, account: list[dict[str, float]], device: torch.device) -> Refined:

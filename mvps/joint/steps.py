@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
 from mvps.joint.observe import ViewSamples
+from mvps.joint.thinned import kept
 from mvps.scene import RELIABLE, Law
 from solvers.least_squares import bounded_step, columns_of_inverse
 
@@ -103,6 +104,23 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
     first, second = tangents(vertices.normal)
     normal = torch.nn.functional.normalize(vertices.normal + turn[:, :1] * first + turn[:, 1:] * second, dim=1)
     return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale, sigma, said)
+
+
+def vertex_steps(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, quick: int, full: int
+) -> Vertices:
+    """`quick` steps under enough lights of each view (thinned.py), then `full` ones under all."""
+    keep = kept([len(of_view.intensity) for of_view in lights])
+    if quick and any(rows.step > 1 for rows in keep):
+        some = [samples.of_lights(rows) for samples, rows in zip(views, keep, strict=True)]
+        of_some = [of_view.of(rows) for of_view, rows in zip(lights, keep, strict=True)]
+    else:
+        some, of_some = views, lights
+    for _ in range(quick):
+        vertices = vertex_step(some, vertices, of_some, law, anchor)
+    for _ in range(full):
+        vertices = vertex_step(views, vertices, lights, law, anchor)
+    return vertices
 
 
 def _least_scale(scale: Tensor, albedo: Tensor) -> float:

@@ -6,6 +6,8 @@ the largest number that leaves ENOUGH_LIGHTS of each view and ENOUGH_PHOTOGRAPHS
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from mvps.scene import Capture, Lights
 
 ENOUGH_LIGHTS = 12
@@ -15,19 +17,21 @@ ENOUGH_PHOTOGRAPHS = 240
 """Twenty views of a dozen lights: of few views a vertex is seen in one or two, which then keep more of their lights."""
 
 
+def kept(counts: Sequence[int]) -> list[slice]:
+    """Which lights of each view stay, for the numbers of lights that the views have; all where there are no more than enough."""
+    spare = sum(counts) // ENOUGH_PHOTOGRAPHS
+    steps = [max(1, min(count // ENOUGH_LIGHTS, spare)) for count in counts]
+    return [slice(i % k, None, k) for i, k in enumerate(steps)]
+
+
 def thinned(capture: Capture, lights: Lights) -> tuple[Capture, Lights]:
-    """The capture with fewer lights of each view, all where there are no more than enough, and their lights."""
-    keep = {}
-    spare = sum(len(view.lights) for view in capture.views) // ENOUGH_PHOTOGRAPHS
-    for i, view in enumerate(capture.views):
-        k = max(1, min(len(view.lights) // ENOUGH_LIGHTS, spare))
-        keep[view.name] = list(range(i % k, len(view.lights), k))
-    if all(len(keep[view.name]) == len(view.lights) for view in capture.views):
+    """The capture with the kept lights of each view, and these lights."""
+    keep = kept([len(view.lights) for view in capture.views])
+    if all(rows.step == 1 for rows in keep):
         return capture, lights
-    part = capture.select({view.name: [view.lights[j] for j in keep[view.name]] for view in capture.views})
+    part = capture.select({view.name: view.lights[rows] for view, rows in zip(capture.views, keep, strict=True)})
     direction, intensity = (
-        tuple(values[keep[view.name]] for view, values in zip(capture.views, of_views, strict=True))
-        for of_views in (lights.direction, lights.intensity)
+        tuple(values[rows] for rows, values in zip(keep, of_views, strict=True)) for of_views in (lights.direction, lights.intensity)
     )
     # Views keep different lights of the rig.
     return part, Lights(direction, intensity, False)
