@@ -35,14 +35,20 @@ def colours(points: np.ndarray) -> np.ndarray:
     return np.where(points[..., :1] < 0, LEFT, RIGHT)
 
 
-def make_sphere(subdivisions: int = 4, coloured_lobes: bool = False, seed: int = 0) -> SphereScene:
-    """Six views along the axes, ten lights of one rig; the refined normals are waves on the sphere's, up to about 10 degrees off."""
+def make_sphere(
+    subdivisions: int = 4, coloured_lobes: bool = False, seed: int = 0, tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> SphereScene:
+    """Six views along the axes, ten lights of one rig; the refined normals are waves on the sphere's, up to about 10 degrees off.
+
+    tint: colour of the lobes where they are coloured.
+    """
     rng = np.random.default_rng(seed)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
     surface = Surface(np.array(ball.vertices), np.array(ball.faces))
     outward = normalise(surface.vertices)
     waves = 0.1 * np.sin(surface.vertices[:, [1, 2, 0]] / 8)
-    weight = np.full((len(outward), 2, 3) if coloured_lobes else (len(outward), 2), 0.15)
+    weight = np.full((len(outward), 2), 0.15)
+    weight = weight[..., None] * np.array(tint) if coloured_lobes else weight
     material = Material(normalise(outward + waves), colours(surface.vertices), weight, np.array([12.0, 60.0]), np.ones(len(outward)))
     cameras = [camera_at(np.array(d, float)) for d in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))]
     tilt = rng.normal(0, 0.5, (10, 2))

@@ -1,4 +1,4 @@
-"""Solvers: low rank, linear, bounded least squares."""
+"""Solvers: low rank, linear, bounded least squares, few bounded variables."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,6 +9,7 @@ import torch
 from scipy.optimize import lsq_linear
 
 from solvers.adam import Adam
+from solvers.bounded import minimise
 from solvers.least_squares import bounded_step
 from solvers.linear import CholeskyLike
 from solvers.low_rank import factorise, robust_weights, solve_rows
@@ -115,3 +116,19 @@ def test_a_matrix_that_is_not_near_is_solved_all_the_same() -> None:
     far = sp.csc_matrix(sp.diags([-np.ones(399), 2.0001 * np.ones(400), -np.ones(399)], [-1, 0, 1]))
     x = rng.normal(size=(400, 2))
     assert np.allclose(CholeskyLike(A).nearby(far, far @ x, np.zeros((400, 2))), x, atol=1e-6)
+
+
+def test_few_bounded_variables_are_solved_within_their_bounds_and_calls() -> None:
+    calls = []
+
+    def bowl(x: np.ndarray) -> float:
+        calls.append(x)
+        return float("nan") if x[0] > 0.9 else float((x[0] - 0.4) ** 2 + 3 * (x[1] + 2) ** 2)
+
+    best, value = minimise(bowl, np.zeros(2), np.array([-1.0, -1.0]), np.ones(2), 0.5, 0.01, 40)
+    assert np.allclose(best, [0.4, -1.0], atol=0.05) and value == bowl(best) and len(calls) <= 41
+
+
+def test_a_bounded_search_never_ends_worse_than_its_start() -> None:
+    best, value = minimise(lambda x: float(np.abs(x).sum()), np.zeros(1), -np.ones(1), np.ones(1), 0.5, 0.1, 5)
+    assert best == 0 and value == 0

@@ -7,7 +7,8 @@ steps.py        steps of the vertices, ties, confidence
 lights.py       lights with the vertices eliminated
 trial.py        held-out errors of a reflectance model
 pixels.py       normals of single views at their pixels
-reflectance.py  colour
+reflectance.py  colours of the lights
+colours.py      colours of body and lobes
 photometry.py   the photometric part of a round
 fused.py        the views' normals together, on vertices and faces
 vertices.py     positions from normals and from the agreement of views

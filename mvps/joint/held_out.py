@@ -24,7 +24,8 @@ def carried_over(lights: Lights, rotations: list[Float], rotation: Float) -> tup
 
 
 def _vertices(material: Material) -> Vertices:
-    reflectance = np.column_stack([material.albedo.mean(1), material.specular_weight])
+    weight = material.specular_weight.mean(2) if material.specular_weight.ndim == 3 else material.specular_weight
+    reflectance = np.column_stack([material.albedo.mean(1), weight])
     normal, values = (torch.tensor(a, dtype=torch.float32) for a in (material.normal, reflectance))
     # Residuals of about a tenth of the albedo are outliers until the lights are known.
     return Vertices(normal, values, 0.1 * values[:, 0].clamp_min(1e-6))

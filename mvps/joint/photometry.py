@@ -109,7 +109,7 @@ def _started(
     return Vertices(_tensor(normal, device), reflectance, torch.full((len(normal),), level, device=device))
 
 
-def _drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) -> torch.Tensor:
+def drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) -> torch.Tensor:
     """Indices of a random part of the vertices that are seen, in order."""
     seen = torch.cat([samples.vertex for samples in views]).unique()
     order = generator.permutation(len(seen))[:count]
@@ -117,14 +117,16 @@ def _drawn(views: list[ViewSamples], count: int, generator: np.random.Generator)
     return drawn
 
 
-def _choose_model(state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, some: torch.Tensor) -> None:
-    """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account."""
+def _choose_model(state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, some: torch.Tensor) -> list[int]:
+    """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account. Which of the
+    state's lobes stay."""
     few, part, tie = subset(few, start, anchor, some)
     rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
-    lights = grey_lights(state.lights, some.device)
-    state.model, state.trials = choose(candidates(SHARPNESS), lambda model: held_out_errors(few, part, lights, tie, rotations, model))
-    law = state.law
+    lights, law = grey_lights(state.lights, some.device), state.law
+    added = candidates(law.sharpness)
+    state.model, state.trials = choose(added, lambda model: held_out_errors(few, part, lights, tie, rotations, model))
     state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
+    return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
 
 
 def _solve_lights(
@@ -185,7 +187,7 @@ def photometric_round(
     state.views = observe(part, state.surface, part_lights, device)
     mesh_normal = vertex_normals(state.surface)
     vertices = _started(state, part, part_lights, mesh_normal, carried, device)
-    some = _drawn(state.views, LIGHT_VERTICES, generator)
+    some = drawn(state.views, LIGHT_VERTICES, generator)
     few = state.views
     if part is not capture:
         among = np.zeros(len(mesh_normal), bool)
@@ -200,9 +202,9 @@ def photometric_round(
 
     if task.choose and not state.trials:
         tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
-        trial = _drawn(few, TRIAL_VERTICES, generator)
-        _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial)
-        vertices = replace(vertices, reflectance=vertices.reflectance[:, : 1 + len(state.law.sharpness)])
+        trial = drawn(few, TRIAL_VERTICES, generator)
+        lobes = _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial)
+        vertices = replace(vertices, reflectance=vertices.reflectance[:, [0, *(1 + k for k in lobes)]])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights = vertices.normal, grey_lights(part_lights, device)
     vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS, 0)

@@ -17,11 +17,12 @@ from scipy.spatial import cKDTree
 
 from mvps.camera import pixel_footprint
 from mvps.joint.blocks import Vertices
+from mvps.joint.colours import colours, lobes_in_colour
 from mvps.joint.fused import face_targets
 from mvps.joint.observe import channel_ratio, visible_in
-from mvps.joint.photometry import WEAK_TIE, State, Task, grey_albedo, grey_lights, material_of, photometric_round
+from mvps.joint.photometry import TRIAL_VERTICES, WEAK_TIE, State, Task, drawn, grey_albedo, grey_lights, material_of, photometric_round
 from mvps.joint.pixels import OWN_LIGHTS
-from mvps.joint.reflectance import Observed, coloured_albedo
+from mvps.joint.reflectance import Observed
 from mvps.joint.steps import stated_confidence
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.material import Trial
@@ -170,19 +171,28 @@ def refine(
             carried = (moved, state.vertices)
         account.append({"round": float(number), "vertices": float(len(shift)), **changes})
         on_round(number, account[-1])
-    return replace(_finished(state, capture if settings.final else None, account, on), carried=carried)
+    return replace(_finished(state, capture if settings.final else None, account, on, generator), carried=carried)
 
 
-def _finished(state: State, capture: Capture | None, account: list[dict[str, float]], device: torch.device) -> Refined:
-    """The result, with albedo in the colours of a capture's photographs, or grey without one."""
+def _finished(
+    state: State, capture: Capture | None, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
+) -> Refined:
+    """The result, with albedo and lobes in the colours of a capture's photographs, or grey without one."""
     assert state.vertices is not None
-    lights, albedo = state.lights, grey_albedo(state.vertices)
+    lights, albedo, tint = state.lights, grey_albedo(state.vertices), None
     if capture is not None:
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
-        albedo = coloured_albedo(Observed(capture, state.surface, state.views, state.vertices, grey, state.law), ratios)
+        observed = Observed(capture, state.surface, state.views, state.vertices, grey, state.law)
+        if state.law.sharpness:
+            state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
+        in_colour = bool(state.law.sharpness) and state.trials[-1].kept
+        albedo, tint = colours(observed, ratios, in_colour)
+        tint = tint if in_colour else None
     pairs = torch.from_numpy(edges(state.surface)).to(device)
     stated = stated_confidence(state.vertices, WEAK_TIE, pairs).double().cpu().numpy()
     material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0))
+    if tint is not None:
+        material = replace(material, specular_weight=material.specular_weight[..., None] * tint)
     status, text = _verdict(account)
     return Refined(state.surface, material, lights, state.maps, state.law, state.trials, account, status, text)
 

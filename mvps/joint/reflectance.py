@@ -1,4 +1,4 @@
-"""Colour: albedo per channel and the lights' colours, once normals, weights and grey intensities are known.
+"""The lights' colours, once normals, weights and grey intensities are known.
 
 A light's colour r (mean 1 over its channels) is what is left when the vertex's own colour g is taken out, where the diffuse part d of the
 grey prediction P outweighs the lobes (they may have the light's colour, the albedo's, or neither):
@@ -6,11 +6,11 @@ grey prediction P outweighs the lobes (they may have the light's colour, the alb
     radiance_c / e = g_c r_c P,     weights (d / P)^2 on top of the robust ones
 
 is linear in g and in r, which are solved in turn as robust ratios of sums. One factor per channel is free: r has mean one over the lights.
-With r known, the albedo of a channel is linear too:  radiance_c / (e r_c) = a_c q + sum_k w_k q_k,   q = dI/da and q_k of blocks.py.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from mvps.camera import bilinear, project
 from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, evaluate, robust
 from mvps.joint.observe import ViewSamples
-from mvps.scene import Capture, Float, Law, Surface
+from mvps.scene import Capture, Float, Int, Law, Surface
 
 COLOUR_SWEEPS = 3
 PAIRS_PER_CHUNK = 2048
@@ -37,40 +37,55 @@ class Observed(NamedTuple):
     law: Law
 
 
+class Chunk(NamedTuple):
+    """Samples of some pairs of a view. rows (n,): their vertices; part: of the view's pairs; per light (n, lights): robust weight, basis
+    q = dI/da, diffuse d and grey prediction P; image (n, lights, 3): radiance."""
+
+    part: slice
+    rows: Int
+    weight: NDArray[np.float32]
+    basis: NDArray[np.float32]
+    diffuse: NDArray[np.float32]
+    predicted: NDArray[np.float32]
+    image: NDArray[np.float32]
+
+
+def chunks(of: Observed, i: int) -> Iterator[Chunk]:
+    """The samples of view i with their colours."""
+    view, samples, vertices, lights = of.capture.views[i], of.views[i], of.vertices, of.lights[i]
+    for start in range(0, len(samples.vertex), PAIRS_PER_CHUNK):
+        part = slice(start, start + PAIRS_PER_CHUNK)
+        index, towards = samples.vertex[part], samples.towards[part]
+        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, of.law, samples.gathered_of(part))
+        weight = samples.weight[part, None] * samples.data[part] * robust(shaded.predicted - samples.image[part], vertices.scale[index])
+        diffuse = shaded.basis[0] * vertices.reflectance[index, :1]
+        rows = index.cpu().numpy()
+        positions, weights = bilinear(view.pixel_index, project(view.camera, of.surface.vertices[rows])[0])
+        image = np.einsum("pklc,pk->plc", view.samples[positions].astype(np.float32) * np.float32(view.scale), weights)
+        w, basis, body, predicted = (t.cpu().numpy() for t in (weight, shaded.basis[0], diffuse, shaded.predicted))
+        yield Chunk(part, rows, w, basis, body, predicted, image)
+
+
 class _Sums(NamedTuple):
-    """Numerators and denominators: of a vertex's colour and albedo, per pair (n, 3) and (n,); of a light's colour (lights, 3)."""
+    """Numerators and denominators: of a vertex's colour, per pair (n, 3) and (n,); of a light's colour (lights, 3)."""
 
     colour: Float
     colour_weight: Float
-    albedo: Float
-    albedo_weight: Float
     light: Float
     light_weight: Float
 
 
 def _sums(of: Observed, i: int, ratio: NDArray[np.float32], colour: NDArray[np.float32]) -> _Sums:
     """Those of view i."""
-    view, samples, vertices, lights = of.capture.views[i], of.views[i], of.vertices, of.lights[i]
-    n, count = len(samples.vertex), len(ratio)
-    out = _Sums(np.zeros((n, 3)), np.zeros(n), np.zeros((n, 3)), np.zeros(n), np.zeros((count, 3)), np.zeros((count, 3)))
-    for start in range(0, n, PAIRS_PER_CHUNK):
-        part = slice(start, start + PAIRS_PER_CHUNK)
-        index, towards = samples.vertex[part], samples.towards[part]
-        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, of.law, samples.gathered_of(part))
-        weight = samples.weight[part, None] * samples.data[part] * robust(shaded.predicted - samples.image[part], vertices.scale[index])
-        w, q, predicted = (t.cpu().numpy() for t in (weight, shaded.basis[0], shaded.predicted))
-        diffuse = q * vertices.reflectance[index, :1].cpu().numpy()
-        body = w * (diffuse / np.maximum(predicted, 1e-12)) ** 2
-        rows = index.cpu().numpy()
-        positions, weights = bilinear(view.pixel_index, project(view.camera, of.surface.vertices[rows])[0])
-        image = np.einsum("pklc,pk->plc", view.samples[positions].astype(np.float32) * np.float32(view.scale), weights)
-        white = image / ratio
-        out.colour[part] = np.einsum("pl,plc->pc", body * predicted, white)
-        out.colour_weight[part] = (body * predicted**2).sum(1)
-        out.albedo[part] = np.einsum("pl,plc->pc", w * q, white) - (w * q * (predicted - diffuse)).sum(1)[:, None]
-        out.albedo_weight[part] = (w * q * q).sum(1)
-        out.light[:] += np.einsum("pl,plc,pc->lc", body * predicted, image, colour[rows])
-        out.light_weight[:] += np.einsum("pl,pc->lc", body * predicted**2, colour[rows] ** 2)
+    n, count = len(of.views[i].vertex), len(ratio)
+    out = _Sums(np.zeros((n, 3)), np.zeros(n), np.zeros((count, 3)), np.zeros((count, 3)))
+    for chunk in chunks(of, i):
+        predicted, image = chunk.predicted, chunk.image
+        body = chunk.weight * (chunk.diffuse / np.maximum(predicted, 1e-12)) ** 2
+        out.colour[chunk.part] = np.einsum("pl,plc->pc", body * predicted, image / ratio)
+        out.colour_weight[chunk.part] = (body * predicted**2).sum(1)
+        out.light[:] += np.einsum("pl,plc,pc->lc", body * predicted, image, colour[chunk.rows])
+        out.light_weight[:] += np.einsum("pl,pc->lc", body * predicted**2, colour[chunk.rows] ** 2)
     return out
 
 
@@ -88,17 +103,6 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
         colour = (top / np.maximum(bottom, 1e-12)[:, None]).astype(np.float32)
         ratios = _ratios([(s.light, s.light_weight) for s in _all_sums(of, ratios, colour)], one_rig)
     return ratios
-
-
-def coloured_albedo(of: Observed, ratios: list[Float]) -> NDArray[np.float64]:
-    """Albedo (V, 3) under lights of known channel ratios, NaN where no view sees the vertex."""
-    nothing = np.zeros((len(of.vertices.normal), 3), np.float32)
-    sums = _all_sums(of, ratios, nothing)
-    top, bottom = _over_views(of.views, [(s.albedo, s.albedo_weight) for s in sums], len(nothing))
-    albedo = np.full(nothing.shape, np.nan)
-    known = bottom > 0
-    albedo[known] = np.maximum(top[known] / bottom[known, None], 0)
-    return albedo
 
 
 def _over_views(views: list[ViewSamples], sums: list[tuple[Float, Float]], vertices: int) -> tuple[Float, Float]:

@@ -23,8 +23,8 @@ HELD_OUT_EVERY = 5
 VERTEX_STEPS, LAW_STEPS = 3, 2
 
 
-def _parted(views: list[ViewSamples]) -> tuple[list[ViewSamples], list[ViewSamples]]:
-    """The samples to fit and those kept back."""
+def parted(views: list[ViewSamples]) -> tuple[list[ViewSamples], list[ViewSamples]]:
+    """The samples to fit and those kept back, for choosing a model."""
     fitted, kept = [], []
     for i, samples in enumerate(views):
         back = (torch.arange(samples.image.shape[1], device=samples.image.device) + i) % HELD_OUT_EVERY == 0
@@ -40,7 +40,7 @@ def held_out_errors(
 
     start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals.
     """
-    fitted, kept = _parted(views)
+    fitted, kept = parted(views)
     unknowns = 1 + len(model.sharpness)
     reflectance = torch.cat([start.reflectance[:, :1], start.reflectance.new_zeros(len(start.normal), unknowns - 1)], 1)
     state = Vertices(start.normal, reflectance, start.scale)

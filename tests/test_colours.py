@@ -1,0 +1,56 @@
+"""Colours of body and lobes: recovered from photographs, and lobes coloured only where that predicts better."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from sphere_scene import make_sphere
+
+from mvps.joint.blocks import Vertices
+from mvps.joint.colours import colours, lobes_in_colour
+from mvps.joint.observe import channel_ratio, observe
+from mvps.joint.photometry import grey_lights
+from mvps.joint.reflectance import Observed
+
+CPU = torch.device("cpu")
+
+
+def observed(tint: tuple[float, float, float]) -> tuple[Observed, list[np.ndarray], np.ndarray]:
+    """A ball's photographs with its true grey model, the lights' channel ratios, and the true albedo."""
+    scene = make_sphere(4, coloured_lobes=True, tint=tint)
+    r = scene.reconstruction
+    grey = replace(r.material, specular_weight=r.material.specular_weight.mean(2))
+    reflectance = np.column_stack([grey.albedo.mean(1), grey.specular_weight])
+    normal, values = (torch.tensor(a, dtype=torch.float32) for a in (grey.normal, reflectance))
+    vertices = Vertices(normal, values, 0.1 * values[:, 0])
+    views = observe(scene.capture, r.surface, r.lights, CPU)
+    of = Observed(scene.capture, r.surface, views, vertices, grey_lights(r.lights, CPU), grey.law)
+    return of, [channel_ratio(e) for e in r.lights.intensity], r.material.albedo
+
+
+@pytest.mark.parametrize("tint", [(1.5, 1.1, 0.4), (0.7, 0.9, 1.4)])
+def test_coloured_lobes_are_kept_and_their_colour_found(tint: tuple[float, float, float]) -> None:
+    of, ratios, albedo = observed(tint)
+    assert lobes_in_colour(of, ratios, torch.arange(0, len(albedo), 3)).kept
+    found, lobes = colours(of, ratios, True)
+    assert np.allclose(lobes, tint, atol=0.03)
+    seen = np.isfinite(found).all(1)
+    # Vertices on the seam of the two colours are mixed.
+    assert seen.mean() > 0.9 and np.median(np.abs(found - albedo)[seen]) < 0.01
+
+
+def test_white_lobes_stay_white() -> None:
+    of, ratios, albedo = observed((1.0, 1.0, 1.0))
+    assert not lobes_in_colour(of, ratios, torch.arange(0, len(albedo), 3)).kept
+    found, lobes = colours(of, ratios, False)
+    assert lobes.tolist() == [1, 1, 1] and np.nanmedian(np.abs(found - albedo)) < 0.01
+
+
+def test_without_samples_albedo_is_unknown_and_lobes_are_white() -> None:
+    of, ratios, _ = observed((1.5, 1.1, 0.4))
+    nothing = of._replace(views=[replace(samples, data=torch.zeros_like(samples.data)) for samples in of.views])
+    albedo, tint = colours(nothing, ratios, True)
+    assert np.isnan(albedo).all() and tint.tolist() == [1, 1, 1]
