@@ -1,6 +1,6 @@
 """Which reflectance model an object needs: every component on trial, kept only if held-out photographs are predicted better.
 
-Greedy, in the order given; last the sharpness of the lobes that were kept, the only unknown that no closed step gives.
+Greedy, in this order: lobes from wide to narrow, their sharpness (the only unknown that no closed step gives), the law's other terms.
 With e_v the mean absolute error of vertex v's held-out samples over their mean value, before and after,
 
     gain = mean(log e_before - log e_after),      noise = sd(log e_before - log e_after) / sqrt(n)
@@ -51,23 +51,20 @@ class Trial:
     seconds: float
 
 
-def candidates(sharpness: Sequence[float]) -> list[tuple[str, Callable[[Model], Model]]]:
-    """The components, by name, as functions that add one to a model: lobes from wide to narrow, grazing, inter-reflection."""
+Term = tuple[str, Callable[[Model], Model]]
 
-    def lobe(s: float) -> Callable[[Model], Model]:
-        return lambda model: replace(model, sharpness=(*model.sharpness, s))
-
-    return [
-        *((f"lobe of sharpness {s:g}", lobe(s)) for s in sharpness),
-        ("diffuse term that changes at grazing angles", lambda model: replace(model, grazing=True)),
-        ("inter-reflection", lambda model: replace(model, bounce=True)),
-    ]
+TERMS: tuple[Term, ...] = (
+    ("diffuse term that changes at grazing angles", lambda model: replace(model, grazing=True)),
+    ("inter-reflection", lambda model: replace(model, bounce=True)),
+)
+"""What the law has besides lobes, by name, as functions that add it to a model."""
 
 
-def choose(added: Sequence[tuple[str, Callable[[Model], Model]]], held_out: Callable[[Model], Float]) -> tuple[Model, list[Trial]]:
+def choose(lobes: Sequence[float], held_out: Callable[[Model], Float], terms: Sequence[Term] = TERMS) -> tuple[Model, list[Trial]]:
     """The model that the object needs, starting from Lambert's, and the account of the trials.
 
-    held_out gives the errors (n,) of the vertices' held-out samples under a model, NaN where a vertex has none.
+    lobes: sharpness of the candidates, from wide to narrow. held_out gives the errors (n,) of the vertices' held-out samples under a
+    model, NaN where a vertex has none.
     """
     model = Model()
     errors = held_out(model)
@@ -83,10 +80,12 @@ def choose(added: Sequence[tuple[str, Callable[[Model], Model]]], held_out: Call
         if judgement.kept:
             model, errors = trial, with_it
 
-    for name, add in added:
-        try_out(name, add)
+    for s in lobes:
+        try_out(f"lobe of sharpness {s:g}", lambda chosen, s=s: replace(chosen, sharpness=(*chosen.sharpness, s)))  # type: ignore[misc]
     if model.sharpness:
         try_out("sharpness of the lobes solved", lambda chosen: sharpened(chosen, errors, held_out))
+    for name, add in terms:
+        try_out(name, add)
     return model, trials
 
 

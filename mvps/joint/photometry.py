@@ -24,7 +24,7 @@ from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
-from mvps.material import Model, Trial, candidates, choose
+from mvps.material import Model, Trial, choose
 from mvps.mesh import angles_deg, mean_edge_length, normalise, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 
@@ -123,8 +123,7 @@ def _choose_model(state: State, capture: Capture, few: list[ViewSamples], start:
     few, part, tie = subset(few, start, anchor, some)
     rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
     lights, law = grey_lights(state.lights, some.device), state.law
-    added = candidates(law.sharpness)
-    state.model, state.trials = choose(added, lambda model: held_out_errors(few, part, lights, tie, rotations, model))
+    state.model, state.trials = choose(law.sharpness, lambda model: held_out_errors(few, part, lights, tie, rotations, model))
     state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
     return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
 
