@@ -27,7 +27,7 @@ PRESETS = ("draft", "standard", "fine")
 Numbers = Sequence[int]
 LightNumbers = Numbers | Mapping[str, Numbers]
 
-MOST_TURNS = 5
+MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each still takes a tenth off the errors."""
 
 
@@ -73,7 +73,7 @@ def last_pass(preset: str, free_lights: bool) -> RefineSettings:
         "standard": (RoundSettings(1.5, 1.2, 0.3, crease=0.1),),
         "fine": (RoundSettings(1.0, 1.2, 0.3), RoundSettings(0.8, 1.2, 0.3, crease=0.2), RoundSettings(0.8, 0.6, 0.2, crease=0.1)),
     }[preset]
-    return RefineSettings(rounds, free_lights=free_lights, final=True)
+    return RefineSettings(rounds, free_lights=free_lights, final=True, all_lights=True)
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
@@ -298,12 +298,15 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
 def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, out: Path, progress: Progress) -> None:
     """Textures, report and the result folder."""
     from mvps.export import write_reconstruction
+    from mvps.joint.thinned import thinned
     from mvps.report import report_html
     from mvps.texture import bake
 
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     with progress.stage("textures"):
-        textures = bake(reconstruction.surface, reconstruction.material, lights_of(reconstruction, used), used)
+        # A texel is seen by several views: their kept lights together determine its albedo several times over.
+        part, lights = thinned(used, lights_of(reconstruction, used))
+        textures = bake(reconstruction.surface, reconstruction.material, lights, part)
     metrics = {**reconstruction.metrics, "stages": progress.stages}
     finished = replace(reconstruction, metrics=metrics)
     with progress.stage("report and files"):

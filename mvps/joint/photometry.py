@@ -46,7 +46,7 @@ model is wrong alike for all of them; noise of single vertices averages out."""
 
 @dataclass
 class State:
-    """What one round hands to the next."""
+    """What one round hands to the next. under: the photographs, perhaps thinned, that `views` are samples of, and their lights."""
 
     surface: Surface
     lights: Lights
@@ -55,6 +55,7 @@ class State:
     vertices: Vertices | None = None
     coarse: Gather | None = None
     views: list[ViewSamples] = field(default_factory=list)
+    under: tuple[Capture, Lights] | None = None
     model: Model = field(default_factory=lambda: Model(SHARPNESS, True, True))
     trials: list[Trial] = field(default_factory=list)
 
@@ -219,7 +220,7 @@ def photometric_round(
     vertices = vertex_steps(state.views, vertices, lights, state.law, free, 0, 1)
     state.vertices = vertices
     state.lights = _with_colours(state, capture, few, some)
-    part, part_lights = lit()
+    state.under = part, part_lights = lit()
     state.maps = all_pixel_normals(part, state.surface, material_of(state, grey_albedo(vertices)), part_lights, _sources(state, vertices))
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))

@@ -34,7 +34,8 @@ ALBEDO_TIE, WEIGHT_TIE = 0.3, 0.05
 """Standard deviation of a pixel's albedo over the vertices' albedo, and of a lobe's weight over albedo plus weight. Albedo has edges that a
 mesh blurs; one view's lights hardly tell a lobe from a turned normal, so lobes keep close to what all views say."""
 
-QUICK_STEPS, FULL_STEPS = 2, 1
+QUICK_STEPS = 2
+"""Under enough lights (thinned.py), before one under all."""
 
 OWN_LIGHTS = 4
 """Lights of a view from which its pixels say something of their own: albedo and two angles of a normal are three unknowns."""
@@ -81,11 +82,9 @@ def pixel_normals(
     anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
     lights = [DirectionalLights(light, torch.tensor(intensity.mean(1), dtype=torch.float32))]
     state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
-    some, of_some = [samples.of_lights(quick)], [lights[0].of(quick)]
     for _ in range(QUICK_STEPS):
-        state = vertex_step(some, state, of_some, material.law, anchor)
-    for _ in range(FULL_STEPS):
-        state = vertex_step([samples], state, lights, material.law, anchor)
+        state = vertex_step([samples.of_lights(quick)], state, [lights[0].of(quick)], material.law, anchor, stated=False)
+    state = vertex_step([samples], state, lights, material.law, anchor)
     towards = -view.camera.rotation[2].astype(np.float32)
     pixels = len(points.hit)
     normals = np.tile(towards, (pixels, 1))

@@ -68,11 +68,12 @@ class RoundSettings:
 @dataclass(frozen=True)
 class RefineSettings:
     """rounds: in order; free_lights: solve the lights; final: this is the result, so the components of the reflectance model are chosen by
-    held-out lights in the first round, the last round uses all lights, and colours are solved."""
+    held-out lights in the first round, and colours are solved; all_lights: the last round uses all of them (thinned.py)."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
     final: bool = False
+    all_lights: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,8 +158,8 @@ def refine(
         state.surface = _remeshed(state.surface, round_settings, before, carried, pixel)
         mesh_normal = vertex_normals(state.surface)
         if round_settings.photometric:
-            last = settings.final and number == len(settings.rounds)
-            task = Task(settings.free_lights, settings.final, not last, on)
+            every_light = settings.all_lights and number == len(settings.rounds)
+            task = Task(settings.free_lights, settings.final, not every_light, on)
             changes = photometric_round(state, capture, task, carried, generator)
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
@@ -171,30 +172,31 @@ def refine(
             carried = (moved, state.vertices)
         account.append({"round": float(number), "vertices": float(len(shift)), **changes})
         on_round(number, account[-1])
-    return replace(_finished(state, capture if settings.final else None, account, on, generator), carried=carried)
+    return replace(_finished(state, settings.final, account, on, generator), carried=carried)
 
 
 def _finished(
-    state: State, capture: Capture | None, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
+    state: State, in_colour: bool, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
 ) -> Refined:
-    """The result, with albedo and lobes in the colours of a capture's photographs, or grey without one."""
-    assert state.vertices is not None
-    lights, albedo, tint = state.lights, grey_albedo(state.vertices), None
-    if capture is not None:
+    """The result, with albedo and lobes in the photographs' colours, or grey."""
+    assert state.vertices is not None and state.under is not None
+    albedo, tint = grey_albedo(state.vertices), None
+    if in_colour:
+        photographs, lights = state.under
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
-        observed = Observed(capture, state.surface, state.views, state.vertices, grey, state.law)
+        observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
         if state.law.sharpness:
             state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
-        in_colour = bool(state.law.sharpness) and state.trials[-1].kept
-        albedo, tint = colours(observed, ratios, in_colour)
-        tint = tint if in_colour else None
+        coloured_lobes = bool(state.law.sharpness) and state.trials[-1].kept
+        albedo, tint = colours(observed, ratios, coloured_lobes)
+        tint = tint if coloured_lobes else None
     pairs = torch.from_numpy(edges(state.surface)).to(device)
     stated = stated_confidence(state.vertices, WEAK_TIE, pairs).double().cpu().numpy()
     material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0))
     if tint is not None:
         material = replace(material, specular_weight=material.specular_weight[..., None] * tint)
     status, text = _verdict(account)
-    return Refined(state.surface, material, lights, state.maps, state.law, state.trials, account, status, text)
+    return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
 
 
 def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:

@@ -90,12 +90,14 @@ def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> 
     equations.gradient[:, 2:] += strength * (vertices.reflectance - anchor.reflectance)
 
 
-def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor) -> Vertices:
-    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed."""
+def vertex_step(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, stated: bool = True
+) -> Vertices:
+    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed. stated: and sigma, a fifth of the time."""
     equations = vertex_equations(views, vertices, lights, law)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
     vertices = replace(vertices, scale=scale.clamp_min(_least_scale(scale[equations.count > 0], vertices.reflectance[:, 0])))
-    sigma, said = _sigma(equations, vertices), torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:].clone()
+    sigma, said = _sigma(equations, vertices) if stated else None, torch.diagonal(equations.hessian, dim1=1, dim2=2)[:, 2:].clone()
     add_ties(equations, vertices, anchor)
     lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
     step = bounded_step(equations.hessian, equations.gradient, lower)
@@ -109,17 +111,17 @@ def vertex_step(views: list[ViewSamples], vertices: Vertices, lights: list[Direc
 def vertex_steps(
     views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, quick: int, full: int
 ) -> Vertices:
-    """`quick` steps under enough lights of each view (thinned.py), then `full` ones under all."""
+    """`quick` steps under enough lights of each view (thinned.py), then `full` ones under all; sigma as of the last."""
     keep = kept([len(of_view.intensity) for of_view in lights])
     if quick and any(rows.step > 1 for rows in keep):
         some = [samples.of_lights(rows) for samples, rows in zip(views, keep, strict=True)]
         of_some = [of_view.of(rows) for of_view, rows in zip(lights, keep, strict=True)]
     else:
         some, of_some = views, lights
-    for _ in range(quick):
-        vertices = vertex_step(some, vertices, of_some, law, anchor)
-    for _ in range(full):
-        vertices = vertex_step(views, vertices, lights, law, anchor)
+    for k in range(quick):
+        vertices = vertex_step(some, vertices, of_some, law, anchor, stated=not full and k == quick - 1)
+    for k in range(full):
+        vertices = vertex_step(views, vertices, lights, law, anchor, stated=k == full - 1)
     return vertices
 
 
