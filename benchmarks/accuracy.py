@@ -80,9 +80,17 @@ def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) 
         "seconds": statistics.median(seconds),
         "peak_memory_mb": max(stage["peak_memory_mb"] for stage in stages),
         "status": metrics["status"]["name"],
-        "stages": {stage["name"]: stage["seconds"] for stage in stages},
+        "stages": seconds_of(stages),
         "components": {c["name"]: [c["kept"], c["gain"], c["noise"], c["seconds"]] for c in metrics["model"]["components"]},
     }
+
+
+def seconds_of(stages: list[dict[str, Any]]) -> dict[str, float]:
+    """Seconds by name of the stage; some stages come again."""
+    total: dict[str, float] = {}
+    for stage in stages:
+        total[stage["name"]] = round(total.get(stage["name"], 0.0) + stage["seconds"], 3)
+    return total
 
 
 def table(rows: list[dict[str, Any]]) -> str:

@@ -28,7 +28,8 @@ Numbers = Sequence[int]
 LightNumbers = Numbers | Mapping[str, Numbers]
 
 MOST_TURNS = 6
-"""Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each still takes a tenth off the errors."""
+"""Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
+long as the residual falls."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,9 @@ def shaped(
             "refinement between", capture, surface, refined.lights, refined.maps, refined.law, of_turn, settings, progress, carried
         )
         surface = stage_one(field, refined.maps, CONTINUED, progress)
+        residuals = [turn["residual"] for turn in rounds + refined.rounds if "residual" in turn]
         rounds, carried = rounds + refined.rounds, refined.carried
-        if refined.rounds[-1]["residual"] <= POOR_FIT:
+        if residuals[-1] <= POOR_FIT or residuals[-1] >= residuals[-2]:
             break
     return surface, refined, rounds
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from mvps import evaluate, reconstruct
 from mvps.command import run
 from mvps.export import read_reconstruction
 from mvps.measures import distance_to
+from mvps.occupancy import CONTINUED, OccupancySettings
+from mvps.reconstruct import MOST_TURNS, Settings, shaped
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -149,3 +152,28 @@ def test_bunny_at_a_quarter_of_its_lights(captures: Path, tmp_path: Path) -> Non
     found = figures(out, captures / "bunny")
     assert found["light_error_deg"] < 1.2 and found["intensity_error"] < 0.012
     assert found["map_normal_error_deg"] < 4.5 and found["chamfer_px"] < 0.4
+
+
+@pytest.mark.parametrize(
+    ("residuals", "turns"),
+    [((0.05,), 1), ((0.2, 0.08), 2), ((0.2, 0.15, 0.16), 3), ((0.25, 0.24, 0.23, 0.22, 0.21, 0.2, 0.19), MOST_TURNS)],
+    ids=["fits", "comes to fit", "stops falling", "keeps falling"],
+)
+def test_stage_one_and_two_take_turns_while_the_model_fits_badly(
+    residuals: tuple[float, ...], turns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = iter(residuals)
+    trained: list[int] = []
+
+    def refined(residual: float) -> SimpleNamespace:
+        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, rounds=[{"residual": residual}])
+
+    def one(_: object, __: object, plan: OccupancySettings, ___: object) -> None:
+        trained.append(plan.steps)
+
+    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined(next(made)))
+    monkeypatch.setattr("mvps.reconstruct.stage_one", one)
+    monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    _, last, rounds = shaped(None, None, refined(0.3), Settings("somewhere"), True, None)  # type: ignore[arg-type]
+    assert trained == [OccupancySettings().steps] + turns * [CONTINUED.steps]
+    assert [r["residual"] for r in rounds] == [0.3, *residuals[:turns]] and last.rounds[0]["residual"] == residuals[turns - 1]
