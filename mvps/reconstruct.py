@@ -71,7 +71,7 @@ def last_pass(preset: str, free_lights: bool) -> RefineSettings:
     from mvps.joint.refine import RefineSettings, RoundSettings
 
     rounds = {
-        "standard": (RoundSettings(1.5, 1.2, 0.3, crease=0.1),),
+        "standard": (RoundSettings(1.5, 1.2, 0.3, crease=0.1), RoundSettings(1.5, 1.2, 0.3, crease=0.1, for_detail=True)),
         "fine": (RoundSettings(1.0, 1.2, 0.3), RoundSettings(0.8, 1.2, 0.3, crease=0.2), RoundSettings(0.8, 0.6, 0.2, crease=0.1)),
     }[preset]
     return RefineSettings(rounds, free_lights=free_lights, final=True, all_lights=True)
@@ -258,6 +258,7 @@ def versions() -> dict[str, str]:
 def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them."""
     from mvps.joint.photometry import SHARPNESS
+    from mvps.joint.refine import POOR_FIT
     from mvps.joint.thinned import thinned
 
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
@@ -272,7 +273,9 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
     else:
         rough = stage_two("first refinement", used, surface, start, maps, law, first_pass(free, False), settings, progress)
         surface, between, rounds = shaped(used, grid, rough, settings, free, progress)
-        plan, carried = last_pass(settings.preset, free), between.carried
+        # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
+        plan = last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT)
+        carried = between.carried
         start, maps, law = between.lights, between.maps, between.law
         refined = stage_two("joint refinement", used, surface, start, maps, law, plan, settings, progress, carried)
     with progress.stage("lights and normals of all views"):

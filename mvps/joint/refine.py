@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -44,6 +43,9 @@ further ones together are no longer than this."""
 STILL = 0.5
 """The same for the normals' median turn, over their median standard error: further steps are lost in it."""
 
+MOSTLY = 0.5
+"""Part of a mesh's edges that creases split, above which the object has more detail than the mesh: halves of these are split once more."""
+
 POOR_FIT = 0.1
 """Relative residual above which the model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy objects."""
 
@@ -52,13 +54,14 @@ POOR_FIT = 0.1
 class RoundSettings:
     """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
     lights and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge
-    before it is split."""
+    before it is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY)."""
 
     edge: float
     reach: float
     step: float
     photometric: bool = True
     crease: float = np.inf
+    for_detail: bool = False
 
     def offsets(self) -> Float:
         """Offsets of the sweep, pixels."""
@@ -119,16 +122,18 @@ def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, s
 
 def _remeshed(
     surface: Surface, settings: RoundSettings, before: RoundSettings | None, carried: tuple[Surface, Vertices] | None, pixel: float
-) -> Surface:
-    """The surface with edges as the round wants them. before: the last round, whose mesh stays where it has the same edges."""
+) -> tuple[Surface, float]:
+    """The surface with edges as the round wants them, and the part of them that creases split. before: the last round, whose mesh stays
+    where it has the same edges."""
     if before is None or before.edge != settings.edge:
         surface = isotropic_remesh(surface, settings.edge * pixel)
     if carried is None or not np.isfinite(settings.crease):
-        return surface
+        return surface, 0.0
     nearest = cKDTree(carried[0].vertices).query(surface.vertices)[1]
     normal = carried[1].normal.double().cpu().numpy()[nearest]
     ends = normal[edges(surface)]
-    return split_edges(surface, np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > settings.crease)
+    creased = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > settings.crease
+    return split_edges(surface, creased), float(creased.mean())
 
 
 def refine(
@@ -153,12 +158,15 @@ def refine(
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
     state = State(surface, lights, maps, law)
     account: list[dict[str, float]] = []
-    for number, (before, round_settings) in enumerate(pairwise((None, *settings.rounds)), start=1):
-        assert round_settings is not None
-        state.surface = _remeshed(state.surface, round_settings, before, carried, pixel)
+    before, pending = None, list(settings.rounds)
+    while pending:
+        round_settings = pending.pop(0)
+        state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
+        if creased <= MOSTLY:
+            pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
         if round_settings.photometric:
-            every_light = settings.all_lights and number == len(settings.rounds)
+            every_light = settings.all_lights and not pending
             task = Task(settings.free_lights, settings.final, not every_light, on)
             changes = photometric_round(state, capture, task, carried, generator)
             seen = [s.vertex.cpu().numpy() for s in state.views]
@@ -170,8 +178,9 @@ def refine(
         state.surface = moved
         if state.vertices is not None:
             carried = (moved, state.vertices)
-        account.append({"round": float(number), "vertices": float(len(shift)), **changes})
-        on_round(number, account[-1])
+        before = round_settings
+        account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
+        on_round(len(account), account[-1])
     return replace(_finished(state, settings.final, account, on, generator), carried=carried)
 
 
