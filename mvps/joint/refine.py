@@ -81,7 +81,8 @@ class RefineSettings:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """surface, material and lights; maps: per view its pixels' normals; per round what changed; status in words, and a sentence."""
+    """surface, material and lights; maps: per view its pixels' normals; per round what changed; status in words, and a sentence; carried:
+    the surface with what its vertices were solved to, from which later rounds may go on."""
 
     surface: Surface
     material: Material
@@ -150,6 +151,7 @@ def refine(
 ) -> Refined:
     """Stage II from a rough surface, lights and the views' photometric stereo under these lights.
 
+    carried: what earlier rounds ended with, on another mesh of the object.
     on_round(number from 1, what changed) is called after each round.
     """
     generator = np.random.default_rng(seed)
