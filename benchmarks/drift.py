@@ -20,7 +20,7 @@ from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.thinned import thinned
 from mvps.load import read_capture, read_truth
 from mvps.progress import Progress
-from mvps.reconstruct import Settings, first_lights, first_pass, photometric_stereo, rough_shape, stage_one, stage_two
+from mvps.reconstruct import Settings, first_lights, first_pass, photometric_stereo, rough_shape, shaped, stage_two
 from mvps.scene import Capture, Law, Lights, NormalMap, Truth
 
 HERE = Path(__file__).resolve().parent
@@ -45,8 +45,8 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     grid, hull = rough_shape(capture, progress)
     lights = first_lights(capture, hull, None, settings.seed, progress)
     maps = photometric_stereo(*thinned(capture, lights))
-    state = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)
-    surface = stage_one(capture, grid, state.maps, settings, progress)
+    rough = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)
+    surface, state, _ = shaped(capture, grid, rough, settings, True, progress)
     records = [errors(capture, truth, state.lights, state.maps)]
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))
     for k in range(rounds):
