@@ -93,7 +93,7 @@ class OccupancySettings:
     strides: tuple[int, ...] = (4, 2, 1)
 
 
-CONTINUED = OccupancySettings(steps=100, band=(4.0, 2.0), width=(1.0, 0.5), step=(1.0, 1.0), outlier=(0.5, 0.5), voxel=1.25, strides=(2, 1))
+CONTINUED = OccupancySettings(steps=100, band=(4.0, 2.0), width=(1.0, 0.5), step=(1.0, 1.0), outlier=(0.5, 0.5), strides=(2, 1))
 """For a field that other normal maps have trained already: its surface is off by the last band at most, so all starts where that ended."""
 
 

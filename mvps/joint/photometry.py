@@ -22,7 +22,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathere
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
-from mvps.joint.thinned import thinned
+from mvps.joint.thinned import kept, thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose
 from mvps.mesh import angles_deg, mean_edge_length, normalise, vertex_normals
@@ -206,8 +206,8 @@ def photometric_round(
         lobes = _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial)
         vertices = replace(vertices, reflectance=vertices.reflectance[:, [0, *(1 + k for k in lobes)]])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
-    before, lights = vertices.normal, grey_lights(part_lights, device)
-    vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS, 0)
+    before, lights, keep = vertices.normal, grey_lights(part_lights, device), kept([len(view.lights) for view in part.views])
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, MATERIAL_STEPS if carried is None else CARRIED_STEPS, 0)
     state.views = with_sources(state.views, part_lights)
     few = state.views if part is capture else with_sources(few, state.lights)
     free = with_population(vertices, free)
@@ -215,9 +215,9 @@ def photometric_round(
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(lit()[1], device)
-    vertices = vertex_steps(state.views, vertices, lights, state.law, free, 1, 0)
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, 1, 0)
     last = vertices.normal
-    vertices = vertex_steps(state.views, vertices, lights, state.law, free, 0, 1)
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, 0, 1)
     state.vertices = vertices
     state.lights = _with_colours(state, capture, few, some)
     state.under = part, part_lights = lit()

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
 from mvps.joint.observe import ViewSamples
-from mvps.joint.thinned import kept
 from mvps.scene import RELIABLE, Law
 from solvers.least_squares import bounded_step, columns_of_inverse
 
@@ -109,10 +108,16 @@ def vertex_step(
 
 
 def vertex_steps(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, quick: int, full: int
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    anchor: Anchor,
+    keep: list[slice],
+    quick: int,
+    full: int,
 ) -> Vertices:
-    """`quick` steps under enough lights of each view (thinned.py), then `full` ones under all; sigma as of the last."""
-    keep = kept([len(of_view.intensity) for of_view in lights])
+    """`quick` steps under the lights of each view to `keep` (thinned.py), then `full` ones under all; sigma as of the last."""
     if quick and any(rows.step > 1 for rows in keep):
         some = [samples.of_lights(rows) for samples, rows in zip(views, keep, strict=True)]
         of_some = [of_view.of(rows) for of_view, rows in zip(lights, keep, strict=True)]
