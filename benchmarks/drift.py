@@ -47,7 +47,7 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     maps = photometric_stereo(*thinned(capture, lights))
     rough = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)
     surface, state, _ = shaped(capture, grid, rough, settings, True, progress)
-    records = [errors(capture, truth, state.lights, state.maps)]
+    records = []
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))
     for k in range(rounds):
         state = refine(capture, surface, state.lights, state.maps, state.law, one, k, "cpu", lambda *_: None)
@@ -58,12 +58,12 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
 
 def table(found: dict[str, list[dict[str, float]]]) -> str:
     """Every fifth round as Markdown: light deg / intensity % / normal map deg."""
-    shown = sorted({k for records in found.values() for k in range(len(records)) if k < 5 or k % 5 == 0})
+    shown = sorted({k for records in found.values() for k in range(1, 1 + len(records)) if k < 5 or k % 5 == 0})
     lines = ["| capture | " + " | ".join(str(k) for k in shown) + " |", "|" + "---|" * (len(shown) + 1)]
     for name, records in found.items():
         cells = [
             f"{r['light_error_deg']:.2f} / {100 * r['intensity_error']:.2f} / {r['normal_error_deg']:.2f}"
-            for r in (records[k] for k in shown if k < len(records))
+            for r in (records[k - 1] for k in shown if k <= len(records))
         ]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)

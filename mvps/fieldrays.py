@@ -50,15 +50,17 @@ def _joined(parts: list[tuple[NDArray[Any], ...]]) -> FieldRays:
 
 
 def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre: Float, unit: float) -> FieldRays:
-    """Rays of all foreground pixels. Colour is albedo over the mean albedo, and the normal."""
+    """Rays of the foreground pixels with a confidence over 0. Colour is albedo over the mean albedo, and the normal."""
     trusted = sum(float((maps.albedo.mean(1) * maps.confidence).sum()) for maps in normal_maps)
     total = sum(float(maps.confidence.sum()) for maps in normal_maps)
     level = max(trusted / max(total, 1e-12), 1e-12)
     parts: list[tuple[NDArray[Any], ...]] = []
     for view, maps in zip(capture.views, normal_maps, strict=True):
-        anchor, direction = _anchored(view.camera, view.pixels, centre, unit)
-        colour = np.concatenate([maps.albedo / level, maps.normal], 1)
-        parts.append((anchor, direction, maps.normal, colour, maps.confidence, np.ones(len(anchor)), _stride(view.pixels)))
+        known = maps.confidence > 0
+        pixels, normal = view.pixels[known], maps.normal[known]
+        anchor, direction = _anchored(view.camera, pixels, centre, unit)
+        colour = np.concatenate([maps.albedo[known] / level, normal], 1)
+        parts.append((anchor, direction, normal, colour, maps.confidence[known], np.ones(len(anchor)), _stride(pixels)))
     return _joined(parts)
 
 

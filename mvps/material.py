@@ -60,11 +60,13 @@ TERMS: tuple[Term, ...] = (
 """What the law has besides lobes, by name, as functions that add it to a model."""
 
 
-def choose(lobes: Sequence[float], held_out: Callable[[Model], Float], terms: Sequence[Term] = TERMS) -> tuple[Model, list[Trial]]:
+def choose(
+    lobes: Sequence[float], held_out: Callable[[Model], Float], terms: Sequence[Term] = TERMS, sharpen: bool = True
+) -> tuple[Model, list[Trial]]:
     """The model that the object needs, starting from Lambert's, and the account of the trials.
 
-    lobes: sharpness of the candidates, from wide to narrow. held_out gives the errors (n,) of the vertices' held-out samples under a
-    model, NaN where a vertex has none.
+    lobes: sharpness of the candidates, from wide to narrow; sharpen: solve it, which takes longer than all else. held_out gives the errors
+    (n,) of the vertices' held-out samples under a model, NaN where a vertex has none.
     """
     model = Model()
     errors = held_out(model)
@@ -82,7 +84,7 @@ def choose(lobes: Sequence[float], held_out: Callable[[Model], Float], terms: Se
 
     for s in lobes:
         try_out(f"lobe of sharpness {s:g}", lambda chosen, s=s: replace(chosen, sharpness=(*chosen.sharpness, s)))  # type: ignore[misc]
-    if model.sharpness:
+    if sharpen and model.sharpness:
         try_out("sharpness of the lobes solved", lambda chosen: sharpened(chosen, errors, held_out))
     for name, add in terms:
         try_out(name, add)

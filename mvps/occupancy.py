@@ -31,7 +31,7 @@ import torch
 from torch import Tensor
 
 from mvps.camera import pixel_footprint
-from mvps.field import Lattice, OccupancyField, SampledField, gradient, lattice
+from mvps.field import Grid, OccupancyField, SampledField, covering, gradient
 from mvps.fieldrays import FieldRays, foreground_rays, ring_rays, trace
 from mvps.mesh import largest_component
 from mvps.scene import Capture, Float, NormalMap, SignedDistanceGrid, Surface
@@ -166,16 +166,14 @@ class _Training:
         self.ring_seen = torch.zeros(len(ring.anchor))
         self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long)
         self.trained = trained
-        self.small = [field.first, field.first_bias, field.last, field.last_bias]
         # A tiny epsilon: a node's gradients are small only because few rays pass it.
-        self.optimiser = Adam([field.features, *self.small], betas=(0.9, 0.99), epsilon=1e-12)
+        self.optimiser = Adam([*field.network(), *field.features], betas=(0.9, 0.99), epsilon=1e-12)
 
     def widen(self, stride: int) -> None:
         """Take in the pixels of this stride and find the surface along their rays anew."""
         low, high = self.frame.low, self.frame.high
         values = sampled(self.field, low, high, TRACED)
-        nodes = Lattice(low, torch.tensor([TRACED]), torch.tensor([values.shape]), torch.tensor([0]))
-        frozen = SampledField(values.reshape(-1, 1), nodes)
+        frozen = SampledField(values, Grid(low, TRACED, values.shape))
         self.pool = (self.data.stride >= stride).nonzero()[:, 0]
         self.ring_pool = (self.ring.stride >= min(stride, 2)).nonzero()[:, 0]
 
@@ -188,12 +186,10 @@ class _Training:
         self.seen[self.pool] = traced(self.data, self.pool, False)
         self.ring_seen[self.ring_pool] = traced(self.ring, self.ring_pool, True)
 
-    def march(self, rays: FieldRays, draw: _Draw, around: Tensor, band: float, samples: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Jittered distances, signed distances (rays, samples) and colours (rays, samples, COLOURS) in a band around a distance."""
+    def march(self, rays: FieldRays, draw: _Draw, around: Tensor, band: float, samples: int) -> tuple[Tensor, Tensor]:
+        """Jittered distances (rays, samples) in a band around a distance, and the points (rays, samples, 3) there."""
         distance = around[:, None] + band * ((torch.arange(samples) + draw.jitter) / samples * 2 - 1)
-        points = rays.anchor[draw.chosen][:, None] + distance[..., None] * rays.direction[draw.chosen][:, None]
-        value, colour = self.field(points.view(-1, 3))
-        return distance, value.view(-1, samples), colour.view(-1, samples, COLOURS)
+        return distance, rays.anchor[draw.chosen][:, None] + distance[..., None] * rays.direction[draw.chosen][:, None]
 
     def _draw(self, pool: Tensor, count: int) -> list[_Draw]:
         """Rays drawn from a pool, dealt into PARTS."""
@@ -202,17 +198,19 @@ class _Training:
         aside = torch.randn(count // SMOOTHED, 3, generator=self.generator)
         return [_Draw(*values) for values in zip(*(v.chunk(PARTS) for v in (chosen, jitter, aside)), strict=True)]
 
-    def mask_loss(self, draw: _Draw, band: float, width: float) -> tuple[Tensor, Tensor]:
-        """Cross-entropy of the opacity along rays of the ring, and the distance of their closest approach."""
-        distance, value, _ = self.march(self.ring, draw, self.ring_seen[draw.chosen], band, self.settings.ring_samples)
+    def mask_loss(self, draw: _Draw, distance: Tensor, value: Tensor, width: float) -> tuple[Tensor, Tensor]:
+        """Cross-entropy of the opacity along rays of the ring, and the distance of their closest approach; of samples' distances and signed
+        distances (rays, samples)."""
         _, opacity = composite(value, width)
         nearest = distance.gather(1, value.detach().argmin(1, keepdim=True))[:, 0]
         return torch.nn.functional.binary_cross_entropy(opacity.clamp(1e-4, 1 - 1e-4), self.ring.inside[draw.chosen]), nearest
 
-    def surface_loss(self, draw: _Draw, band: float, width: float, step: float, outlier: float) -> tuple[Tensor, Tensor]:
-        """Normal, colour and smoothness along rays of foreground pixels, and where they meet the surface."""
+    def surface_loss(
+        self, draw: _Draw, distance: Tensor, value: Tensor, colour: Tensor, width: float, step: float, outlier: float
+    ) -> tuple[Tensor, Tensor]:
+        """Normal, colour and smoothness along rays of foreground pixels, and where they meet the surface; of samples' distances, signed
+        distances (rays, samples) and colours (rays, samples, COLOURS)."""
         s, data, chosen = self.settings, self.data, draw.chosen
-        distance, value, colour = self.march(data, draw, self.seen[chosen], band, s.samples)
         weight, opacity = composite(value, width)
         middle = torch.cat([distance[:, :1], (distance[:, 1:] + distance[:, :-1]) / 2], 1)
         depth = crossing(distance, value, (weight * middle).sum(1) / weight.sum(1).clamp_min(1e-4))
@@ -234,18 +232,25 @@ class _Training:
         """One step of the optimiser, rates times `rate`; the loss. The parts of a batch are independent and run on a core each."""
         s = self.settings
         draws, ring_draws = self._draw(self.pool, s.rays), self._draw(self.ring_pool, s.ring_rays)
-        parameters = [self.field.table, *self.small]
+        network, features = self.field.network(), self.field.in_use()
 
         def part(k: int) -> tuple[float, tuple[Tensor, ...], Tensor, Tensor]:
-            loss, seen = self.surface_loss(draws[k], band, width, step, outlier)
-            of_mask, ring_seen = self.mask_loss(ring_draws[k], band, width)
+            draw, ring_draw = draws[k], ring_draws[k]
+            distance, points = self.march(self.data, draw, self.seen[draw.chosen], band, s.samples)
+            ring_distance, ring_points = self.march(self.ring, ring_draw, self.ring_seen[ring_draw.chosen], band, s.ring_samples)
+            # One call for both: its gradients are as large as the grids, whatever the number of points.
+            value, colour = self.field(torch.cat([points.view(-1, 3), ring_points.view(-1, 3)]))
+            of_data, of_ring = value.split([distance.numel(), ring_distance.numel()])
+            colour = colour[: distance.numel()].view(*distance.shape, COLOURS)
+            loss, seen = self.surface_loss(draw, distance, of_data.view(distance.shape), colour, width, step, outlier)
+            of_mask, ring_seen = self.mask_loss(ring_draw, ring_distance, of_ring.view(ring_distance.shape), width)
             total = (loss + s.mask * of_mask) / PARTS
-            return float(total.detach()), torch.autograd.grad(total, parameters), seen, ring_seen
+            return float(total.detach()), torch.autograd.grad(total, network + features), seen, ring_seen
 
         parts = list(self.pool_of_threads.map(part, range(PARTS)))
         for draw, ring_draw, (_, _, seen, ring_seen) in zip(draws, ring_draws, parts, strict=True):
             self.seen[draw.chosen], self.ring_seen[ring_draw.chosen] = seen, ring_seen
-        rates = [rate * s.grid_rate] + [rate * s.network_rate] * len(self.small)
+        rates = [rate * s.network_rate] * len(network) + [rate * s.grid_rate] * len(features)
         self.optimiser.step(list(zip(*(gradients for _, gradients, _, _ in parts), strict=True)), rates, self.pool_of_threads)
         return sum(loss for loss, *_ in parts)
 
@@ -274,18 +279,12 @@ def _frame(capture: Capture, grid: SignedDistanceGrid) -> _Frame:
 
 
 def _field(grid: SignedDistanceGrid, frame: _Frame, settings: OccupancySettings, seed: int) -> OccupancyField:
-    base_lattice = Lattice(
-        torch.tensor((grid.origin - frame.centre) / frame.unit, dtype=torch.float32),
-        torch.tensor([grid.spacing / frame.unit], dtype=torch.float32),
-        torch.tensor([grid.values.shape]),
-        torch.tensor([0]),
-    )
-    base = torch.tensor(grid.values / frame.unit, dtype=torch.float32).reshape(-1, 1)
-    spacings = [settings.finest * 2**level for level in range(settings.levels)][::-1]
+    low = torch.tensor((grid.origin - frame.centre) / frame.unit, dtype=torch.float32)
+    base = torch.tensor(grid.values / frame.unit, dtype=torch.float32)
+    grids = [covering(frame.low, frame.high, settings.finest * 2**level) for level in range(settings.levels)][::-1]
+    base_grid = Grid(low, grid.spacing / frame.unit, base.shape)
     generator = torch.Generator().manual_seed(seed)
-    return OccupancyField(
-        base, base_lattice, lattice(frame.low, frame.high, spacings), settings.features, settings.hidden, COLOURS, generator
-    )
+    return OccupancyField(base, base_grid, grids, settings.features, settings.hidden, COLOURS, generator)
 
 
 class Occupancy:

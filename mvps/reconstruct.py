@@ -27,6 +27,10 @@ PRESETS = ("draft", "standard", "fine")
 Numbers = Sequence[int]
 LightNumbers = Numbers | Mapping[str, Numbers]
 
+TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
+"""Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
+the time."""
+
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
 long as the residual falls."""
@@ -56,14 +60,16 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     from mvps.joint.refine import RefineSettings, RoundSettings
 
     fused = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(3.0, 3.0, 0.5, photometric=False))
-    return RefineSettings((*fused, RoundSettings(2.0 if final else 3.0, 2.0, 0.4)), free_lights=free_lights, final=final)
+    return RefineSettings(
+        (*fused, RoundSettings(2.0 if final else 3.0, 2.0, 0.4)), free_lights=free_lights, final=final, for_field=not final
+    )
 
 
 def between_passes(free_lights: bool) -> RefineSettings:
     """A round on Stage I's surface, for the normals and lights from which Stage I is trained again."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights)
+    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights, for_field=True)
 
 
 def last_pass(preset: str, free_lights: bool) -> RefineSettings:
@@ -74,7 +80,7 @@ def last_pass(preset: str, free_lights: bool) -> RefineSettings:
         "standard": (RoundSettings(1.5, 1.2, 0.3, crease=0.1), RoundSettings(1.5, 1.2, 0.3, crease=0.1, for_detail=True)),
         "fine": (RoundSettings(1.0, 1.2, 0.3), RoundSettings(0.8, 1.2, 0.3, crease=0.2), RoundSettings(0.8, 0.6, 0.2, crease=0.1)),
     }[preset]
-    return RefineSettings(rounds, free_lights=free_lights, final=True, all_lights=True)
+    return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
@@ -311,7 +317,8 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     with progress.stage("textures"):
         # A texel is seen by several views: their kept lights together determine its albedo several times over.
         part, lights = thinned(used, lights_of(reconstruction, used))
-        textures = bake(reconstruction.surface, reconstruction.material, lights, part)
+        density = TEXELS_PER_PIXEL[settings.preset]
+        textures = bake(reconstruction.surface, reconstruction.material, lights, part, density)
     metrics = {**reconstruction.metrics, "stages": progress.stages}
     finished = replace(reconstruction, metrics=metrics)
     with progress.stage("report and files"):

@@ -35,8 +35,6 @@ from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sour
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, Surface, View
 from mvps.visibility import RayCaster
 
-TEXELS_PER_PIXEL = 2
-"""Texels along one pixel's footprint: interpolating twice (photograph, texture) then loses little of what pixels hold."""
 LARGEST_SIDE = 4096
 """Textures larger than this, texels, do not load on every graphics card."""
 FILLED = 0.4
@@ -70,15 +68,15 @@ class Textures:
     from_photographs: float
 
 
-def bake(surface: Surface, material: Material, lights: Lights, capture: Capture) -> Textures:
+def bake(surface: Surface, material: Material, lights: Lights, capture: Capture, texels_per_pixel: float) -> Textures:
     """Textures of a surface with its material, from a capture's photographs under lights (in the order of the capture's views).
 
-    ValueError where the lights do not fit the capture's photographs.
+    texels_per_pixel: along one pixel's footprint. ValueError where the lights do not fit the capture's photographs.
     """
     _check_lights(lights, capture)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
     smallest = np.sqrt(face_areas(surface).sum() / FILLED) / LARGEST_SIDE
-    atlas = build_atlas(surface, max(pixel / TEXELS_PER_PIXEL, float(smallest)))
+    atlas = build_atlas(surface, max(pixel / texels_per_pixel, float(smallest)))
     texels = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
     mesh_normal = vertex_normals(surface)
     position, normal = (_at(texels, surface, values) for values in (surface.vertices, normalise(mesh_normal)))
@@ -227,9 +225,11 @@ def _away_from_border(view: View) -> Bool:
 def _sampled(view: View, hit: Float, albedo: NDArray[np.float32], known: Bool, position: Float, normal: Float) -> tuple[Int, Float, Float]:
     """Which of some surface points (m, 3) the view sees (n,), the albedo (n, 3) of the pixels around them, and its weight (n,)."""
     facing = np.einsum("ni,ni->n", normal, view_directions(view.camera, position))
-    image, depth = project(view.camera, position)
-    chosen = np.flatnonzero((facing > STEEPEST_VIEW) & (depth > 0) & inside_image(view.camera, image))
-    where, share = bilinear(view.pixel_index, image[chosen])
+    chosen = np.flatnonzero(facing > STEEPEST_VIEW)
+    image, depth = project(view.camera, position[chosen])
+    inside = (depth > 0) & inside_image(view.camera, image)
+    chosen, image = chosen[inside], image[inside]
+    where, share = bilinear(view.pixel_index, image)
     pixel = footprint(view.camera, position[chosen])
     # The four pixels around the point hit the surface within a diagonal of it, stretched by the slope.
     near = lengths(hit[where] - position[chosen, None]) < (np.sqrt(2) * pixel / facing[chosen])[:, None]

@@ -30,7 +30,7 @@ def scene() -> SphereScene:
 @pytest.fixture(scope="module")
 def textures(scene: SphereScene) -> Textures:
     r = scene.reconstruction
-    return bake(r.surface, r.material, r.lights, scene.capture)
+    return bake(r.surface, r.material, r.lights, scene.capture, 2)
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_the_contract_names_exactly_these_files(scene: SphereScene, folder: Path
 def test_same_reconstruction_same_bytes(scene: SphereScene, folder: Path, tmp_path: Path) -> None:
     r = scene.reconstruction
     write_reconstruction(
-        read_reconstruction(folder), tmp_path / "again", bake(r.surface, r.material, r.lights, scene.capture), "<p>report</p>"
+        read_reconstruction(folder), tmp_path / "again", bake(r.surface, r.material, r.lights, scene.capture, 2), "<p>report</p>"
     )
     assert contents(tmp_path / "again") == contents(folder)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
-from mvps.field import Interpolation, gradient, lattice
+from mvps.field import covering, gradient
 from mvps.fieldrays import ring_pixels
 from mvps.hull import default_cells, signed_distance
 from mvps.mesh import is_closed, normalise, signed_volume
@@ -36,11 +36,22 @@ def test_a_ray_crosses_a_wall_where_its_distance_is_zero() -> None:
 
 
 def test_interpolation_is_trilinear_and_its_gradients_are_right() -> None:
-    grids = lattice(torch.zeros(3), torch.full((3,), 4.0), [2.0, 1.0])
-    grids = grids._replace(origin=grids.origin.double(), spacing=grids.spacing.double())
-    table = torch.randn(grids.nodes(), 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1), requires_grad=True)
-    points = (torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)) * 3.6 + 0.2).requires_grad_()
-    assert torch.autograd.gradcheck(lambda t, p: Interpolation.apply(t, p, grids), (table, points), atol=1e-6)
+    def at(points: torch.Tensor) -> torch.Tensor:
+        """Of degree one in each coordinate: trilinear interpolation is exact."""
+        x, y, z = points.T
+        return torch.stack([1 + x - 2 * y * z, x * y * z], 1)
+
+    generator = torch.Generator().manual_seed(2)
+    grid = covering(torch.tensor([1.0, 0.0, -2.0]).double(), torch.tensor([5.0, 3.0, 0.0]).double(), 1.0)
+    axes = [low + torch.arange(n) for low, n in zip((1.0, 0.0, -2.0), grid.size, strict=True)]
+    nodes = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    values = at(nodes.reshape(-1, 3)).T.reshape(1, 2, *grid.size).double().requires_grad_()
+    points = (torch.rand(6, 3, dtype=torch.float64, generator=generator) * torch.tensor([4.0, 3, 2]) + grid.low).requires_grad_()
+    assert grid.size == (5, 4, 3) and torch.allclose(grid.interpolate(values, points), at(points))
+    assert torch.autograd.gradcheck(grid.interpolate, (values, points), atol=1e-6)
+    outside = points.detach() + torch.tensor([0.0, 0.0, 9.0])
+    border = torch.cat([points.detach()[:, :2], torch.zeros(6, 1)], 1)
+    assert torch.allclose(grid.interpolate(values, outside), grid.interpolate(values, border))
 
 
 def test_finite_differences_give_a_spheres_normals() -> None:

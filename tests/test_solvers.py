@@ -85,20 +85,22 @@ def test_rank_deficient_problems_give_finite_damped_steps(rank: int) -> None:
     assert torch.isfinite(step).all() and step[rank:].abs().max() == 0
 
 
-def test_adam_steps_like_torch_and_only_the_rows_in_use() -> None:
+def test_adam_steps_like_torch_and_only_the_parameters_in_use() -> None:
     generator = torch.Generator().manual_seed(0)
-    table, mine = (torch.randn(40, 3, generator=torch.Generator().manual_seed(1)) for _ in range(2))
-    theirs = torch.optim.Adam([table.requires_grad_()], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
-    ours = Adam([mine], (0.9, 0.99), 1e-8)
+    shapes = ((2, 5, 3), (30, 3))
+    start = [torch.randn(shape, generator=generator) for shape in shapes]
+    theirs, ours = ([p.clone() for p in start] for _ in range(2))
+    reference = torch.optim.Adam([p.requires_grad_() for p in theirs], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    adam = Adam(ours, (0.9, 0.99), 1e-8)
     with ThreadPoolExecutor(2) as pool:
         for step in range(6):
-            used = 10 if step < 3 else 40
-            halves = [torch.randn(used, 3, generator=generator) for _ in range(2)]
-            table.grad = torch.zeros_like(table)
-            table.grad[:used] = halves[0] + halves[1]
-            theirs.step()
-            ours.step([halves], [0.1], pool)
-    assert torch.allclose(mine, table.detach(), atol=1e-6)
+            used = 1 if step < 3 else 2
+            halves = [[torch.randn(shape, generator=generator) for _ in range(2)] for shape in shapes[:used]]
+            for k, p in enumerate(theirs):
+                p.grad = halves[k][0] + halves[k][1] if k < used else torch.zeros_like(p)
+            reference.step()
+            adam.step(halves, [0.1] * used, pool)
+    assert all(torch.allclose(mine, p.detach(), atol=1e-6) for mine, p in zip(ours, theirs, strict=True))
 
 
 def test_a_factor_serves_a_nearby_matrix() -> None:

@@ -241,7 +241,7 @@ def baked(scene: SphereScene) -> Textures:
     """From a material whose albedo is grey: the colours can only come from the photographs."""
     r = scene.reconstruction
     grey = replace(r.material, albedo=np.full_like(r.material.albedo, 0.6))
-    return bake(r.surface, grey, r.lights, scene.capture)
+    return bake(r.surface, grey, r.lights, scene.capture, 2)
 
 
 def texel_positions(scene: SphereScene, atlas: Atlas) -> tuple[np.ndarray, ...]:
@@ -265,7 +265,7 @@ def test_texels_without_a_photograph_keep_the_vertices_albedo(scene: SphereScene
     one = Capture("one", scene.capture.views[:1])
     lights = Lights(r.lights.direction[:1], r.lights.intensity[:1], True)
     grey = replace(r.material, albedo=np.full_like(r.material.albedo, 0.6))
-    textures = bake(r.surface, grey, lights, one)
+    textures = bake(r.surface, grey, lights, one, 2)
     row, column, position = texel_positions(scene, textures.atlas)
     colour = linear_from_srgb(textures.base_color[row, column]) * textures.scale
     np.testing.assert_allclose(colour[position[:, 0] < 0], 0.6, atol=0.01)
@@ -293,7 +293,7 @@ def test_a_hidden_part_takes_no_colour_from_what_hides_it() -> None:
     radiance = photograph(RayCaster(surface), material, view.camera, view.pixels, lights.direction[0], lights.intensity[0])
     samples = np.rint(radiance / 2 * 65535).astype(np.uint16)
     wrong = replace(material, albedo=np.full_like(albedo, 0.1))
-    textures = bake(surface, wrong, lights, Capture("two", (replace(view, samples=samples),)))
+    textures = bake(surface, wrong, lights, Capture("two", (replace(view, samples=samples),)), 2)
     t = rasterise(textures.atlas.uv, textures.atlas.faces, textures.atlas.height, textures.atlas.width)
     x = (surface.vertices[surface.faces[t.face]] * t.barycentric[..., None]).sum(1)
     colour = (linear_from_srgb(textures.base_color[t.row, t.column]) * textures.scale).mean(1)
@@ -359,7 +359,7 @@ def test_a_matt_surface_says_so(scene: SphereScene) -> None:
     r = scene.reconstruction
     n = len(r.material.albedo)
     matt = replace(r.material, specular_weight=np.zeros((n, 0)), sharpness=np.zeros(0))
-    textures = bake(r.surface, matt, r.lights, scene.capture)
+    textures = bake(r.surface, matt, r.lights, scene.capture, 2)
     document, _ = glb_parts(glb_bytes(r.surface.vertices, textures))
     material = document["materials"][0]  # type: ignore[index]
     assert material["extensions"]["KHR_materials_specular"] == {"specularFactor": 0.0}
@@ -399,7 +399,7 @@ def test_messages(scene: SphereScene) -> None:
     r = scene.reconstruction
     few = Lights(r.lights.direction[:2], r.lights.intensity[:2], True)
     with pytest.raises(ValueError, match=r"lights: wanted one per photograph of every view \(\[10, 10, .*given \[10, 10\]"):
-        bake(r.surface, r.material, few, scene.capture)
+        bake(r.surface, r.material, few, scene.capture, 2)
     for image in (np.zeros((2, 2, 4), np.uint8), np.zeros((2, 2), np.int64), np.zeros((0, 2), np.uint8)):
         with pytest.raises(ValueError, match="image: wanted"):
             png_bytes(image)

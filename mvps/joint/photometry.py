@@ -7,6 +7,7 @@ of every view's own pixels (pixels.py)
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,12 +63,15 @@ class State:
 
 @dataclass(frozen=True)
 class Task:
-    """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; thinned: vertices and pixels
-    under ENOUGH_LIGHTS lights of each view; device of the tensors."""
+    """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; sharpen: and solve the lobes'
+    sharpness; thinned: vertices and pixels under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device of the
+    tensors."""
 
     free_lights: bool
     choose: bool
+    sharpen: bool
     thinned: bool
+    half: bool
     device: torch.device
 
 
@@ -118,13 +122,16 @@ def drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) 
     return drawn
 
 
-def _choose_model(state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, some: torch.Tensor) -> list[int]:
+def _choose_model(
+    state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, some: torch.Tensor, sharpen: bool
+) -> list[int]:
     """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account. Which of the
     state's lobes stay."""
     few, part, tie = subset(few, start, anchor, some)
     rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
     lights, law = grey_lights(state.lights, some.device), state.law
-    state.model, state.trials = choose(law.sharpness, lambda model: held_out_errors(few, part, lights, tie, rotations, model))
+    errors = partial(held_out_errors, few, part, lights, tie, rotations)
+    state.model, state.trials = choose(law.sharpness, errors, sharpen=sharpen)
     state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
     return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
 
@@ -203,7 +210,7 @@ def photometric_round(
     if task.choose and not state.trials:
         tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
         trial = drawn(few, TRIAL_VERTICES, generator)
-        lobes = _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial)
+        lobes = _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial, task.sharpen)
         vertices = replace(vertices, reflectance=vertices.reflectance[:, [0, *(1 + k for k in lobes)]])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights, keep = vertices.normal, grey_lights(part_lights, device), kept([len(view.lights) for view in part.views])
@@ -221,7 +228,8 @@ def photometric_round(
     state.vertices = vertices
     state.lights = _with_colours(state, capture, few, some)
     state.under = part, part_lights = lit()
-    state.maps = all_pixel_normals(part, state.surface, material_of(state, grey_albedo(vertices)), part_lights, _sources(state, vertices))
+    material = material_of(state, grey_albedo(vertices))
+    state.maps = all_pixel_normals(part, state.surface, material, part_lights, _sources(state, vertices), task.half)
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None

@@ -22,7 +22,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_steps
 from mvps.joint.thinned import kept
 from mvps.mesh import normalise
-from mvps.rendering import Points, points_under, shadow_at
+from mvps.rendering import points_under, shadow_at
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
 from mvps.visibility import RayCaster
 
@@ -41,17 +41,18 @@ OWN_LIGHTS = 4
 """Lights of a view from which its pixels say something of their own: albedo and two angles of a normal are three unknowns."""
 
 
-def _samples(view: View, points: Points, shadow: Bool, intensity: Float, hit: Int) -> ViewSamples:
+def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: Int) -> ViewSamples:
+    """Of some of the view's pixels, rows (n,), which show position (n, 3)."""
     image, usable = grey_radiance(view, intensity)
-    image, data = image[hit], usable[hit] & ~shadow[hit]
-    towards = view_directions(view.camera, points.position[hit]).astype(np.float32)
-    n = len(hit)
+    image, data = image[rows], usable[rows] & ~shadow
+    towards = view_directions(view.camera, position).astype(np.float32)
+    n = len(rows)
     return ViewSamples(torch.arange(n), torch.from_numpy(towards), torch.ones(n), torch.from_numpy(image), torch.from_numpy(data))
 
 
-def _chroma(view: View, intensity: Float, hit: Int) -> NDArray[np.float32]:
+def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
     """(n, 3) share of the channels in a pixel's radiance under white light, mean 1."""
-    white = (view.samples[hit] * (1 / channel_ratio(intensity)).astype(np.float32)).sum(1)
+    white = (view.samples[rows] * (1 / channel_ratio(intensity)).astype(np.float32)).sum(1)
     chroma: NDArray[np.float32] = white / np.maximum(white.mean(1, keepdims=True), 1e-12)
     return chroma
 
@@ -64,15 +65,18 @@ def pixel_normals(
     direction: Float,
     intensity: Float,
     quick: slice,
+    every_other: bool,
 ) -> NormalMap:
     """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
 
     sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3);
-    quick: lights of the first steps.
+    quick: lights of the first steps; every_other: only half of the pixels, like the white squares of a chessboard; confidence 0 elsewhere.
     """
-    points = points_under(caster, material, view.camera, view.pixels)
+    chosen = np.flatnonzero(view.pixels.sum(1) % 2 == 0) if every_other else np.arange(len(view.pixels))
+    points = points_under(caster, material, view.camera, view.pixels[chosen])
     hit = np.flatnonzero(points.hit)
-    samples = _samples(view, points, shadow_at(caster, points, direction), intensity, hit)
+    rows, shadow = chosen[hit], shadow_at(caster, points, direction)[hit]
+    samples = _samples(view, points.position[hit], shadow, intensity, rows)
     if sources is not None:
         G = at(sources, gathered(sources, direction, material.bounce), points.position[hit], points.mesh_normal[hit])
         samples = replace(samples, gathered=torch.from_numpy(G))
@@ -84,23 +88,27 @@ def pixel_normals(
     state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
     state = vertex_steps([samples], state, lights, material.law, anchor, [quick], QUICK_STEPS, 1)
     towards = -view.camera.rotation[2].astype(np.float32)
-    pixels = len(points.hit)
+    pixels = len(view.pixels)
     normals = np.tile(towards, (pixels, 1))
     albedo, certain = np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
-    normals[hit] = normalise(state.normal.double().numpy())
-    albedo[hit] = state.reflectance[:, :1].numpy() * _chroma(view, intensity, hit)
-    certain[hit] = confidence(state).numpy()
+    normals[rows] = normalise(state.normal.double().numpy())
+    albedo[rows] = state.reflectance[:, :1].numpy() * _chroma(view, intensity, rows)
+    certain[rows] = confidence(state).numpy()
     if len(view.lights) < OWN_LIGHTS:
         # What is known comes from the vertex, which other views saw under other lights.
-        certain[hit] = np.maximum(certain[hit], points.confidence[hit])
+        certain[rows] = np.maximum(certain[rows], points.confidence[hit])
     return NormalMap(normals, albedo, certain)
 
 
 def all_pixel_normals(
-    capture: Capture, surface: Surface, material: Material, lights: Lights, sources: Sources | None
+    capture: Capture, surface: Surface, material: Material, lights: Lights, sources: Sources | None, every_other: bool = False
 ) -> tuple[NormalMap, ...]:
     """`pixel_normals` of every view, on all cores."""
-    caster = RayCaster(surface)
+    caster, quick = RayCaster(surface), kept([len(view.lights) for view in capture.views])
+
+    def one(i: int) -> NormalMap:
+        of_view = capture.views[i], caster, sources, material, lights.direction[i], lights.intensity[i]
+        return pixel_normals(*of_view, quick[i], every_other)
+
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        tasks = zip(capture.views, lights.direction, lights.intensity, kept([len(view.lights) for view in capture.views]), strict=True)
-        return tuple(pool.map(lambda task: pixel_normals(task[0], caster, sources, material, *task[1:]), tasks))
+        return tuple(pool.map(one, range(len(capture.views))))

@@ -72,12 +72,15 @@ class RoundSettings:
 @dataclass(frozen=True)
 class RefineSettings:
     """rounds: in order; free_lights: solve the lights; final: this is the result, so the components of the reflectance model are chosen by
-    held-out lights in the first round, and colours are solved; all_lights: the last round uses all of them (thinned.py)."""
+    held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the last round uses all
+    lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, and draws fewer rays than
+    there are pixels, so the last round leaves the surface and half of the pixels."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
     final: bool = False
-    all_lights: bool = False
+    in_full: bool = False
+    for_field: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,14 +171,17 @@ def refine(
         if creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
+        leaves_surface = settings.for_field and not pending
         if round_settings.photometric:
-            every_light = settings.all_lights and not pending
-            task = Task(settings.free_lights, settings.final, not every_light, on)
+            every_light = settings.in_full and not pending
+            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, leaves_surface, on)
             changes = photometric_round(state, capture, task, carried, generator)
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
             seen, changes = [index for index, _ in visible_in(capture, state.surface)], {}
-        moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings.offsets(), pixel)
+        moved = state.surface
+        if not leaves_surface:
+            moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings.offsets(), pixel)
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
         state.surface = moved
