@@ -2,9 +2,9 @@
 
     python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard] [--repeats 3]
 
-CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures. Writes accuracy-PRESET.json and
-accuracy-PRESET.md beside this file: errors against ground truth (which the reconstruction never reads), seconds of the whole command, and
-its peak memory, with the machine named.
+CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures; `large` is made
+for the purpose where it is not there, and thrown away. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file, where cases of earlier runs stay: errors against ground truth
+(which the reconstruction never reads), seconds of the whole command, and its largest resident set, with the machine named.
 """
 
 from __future__ import annotations
@@ -32,8 +32,12 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "bunny-4-lights": ("bunny", ["--lights", "1,11,21,32"]),
     "bunny-1-light-a-view": ("bunny", ["--lights", "ONE_LIGHT"]),
     "bunny-held-out-views": ("bunny", ["--hold-out-views", "4,8,12,16,20"]),
+    "large": ("large", []),
 }
 """Name: capture and options of mvps.reconstruct. ONE_LIGHT stands for a file that gives view k light 1 + 7 k mod 32."""
+
+MADE = {"large": ["--views", "20", "--lights", "96", "--size", "400"]}
+"""Captures that `mvps.synthetic` makes, with their options."""
 
 COLUMNS = (
     ("light deg", "light_error_deg", 1, 2),
@@ -60,15 +64,18 @@ def machine() -> str:
 def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) -> dict[str, Any]:
     """One row: the figures of one case; seconds are the median of `repeats` runs."""
     capture, options = captures / CASES[name][0], CASES[name][1]
+    if capture.name in MADE and not capture.exists():
+        capture = folder / f"{capture.name}-capture"
+        subprocess.run([sys.executable, "-m", "mvps.synthetic", "--out", str(capture), "--quiet", *MADE[CASES[name][0]]], check=True)
     one_light = folder / "one-light.json"
     one_light.write_text(json.dumps({f"view_{k:02d}": [1 + 7 * k % 32] for k in range(1, 21)}), encoding="utf-8")
     options = [str(one_light) if option == "ONE_LIGHT" else option for option in options]
     result, figures = folder / name, folder / f"{name}.json"
-    seconds = []
+    seconds, peaks = [], []
     for _ in range(repeats):
         start = time.perf_counter()
         command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet", *options]
-        subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+        peaks.append(peak_mb([sys.executable, *command]))
         seconds.append(time.perf_counter() - start)
     command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture), "--json", str(figures)]
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
@@ -78,11 +85,20 @@ def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) 
         "case": name,
         **metrics["truth"],
         "seconds": statistics.median(seconds),
-        "peak_memory_mb": max(stage["peak_memory_mb"] for stage in stages),
+        "peak_memory_mb": max(peaks),
         "status": metrics["status"]["name"],
         "stages": seconds_of(stages),
         "components": {c["name"]: [c["kept"], c["gain"], c["noise"], c["seconds"]] for c in metrics["model"]["components"]},
     }
+
+
+def peak_mb(command: list[str]) -> float:
+    """Runs a command; its largest resident set, 10^6 bytes (Linux counts it in units of 1024)."""
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        raise SystemExit(f"{' '.join(command)}: exit code {os.waitstatus_to_exitcode(status)}")
+    return usage.ru_maxrss * 1024 / 1e6
 
 
 def seconds_of(stages: list[dict[str, Any]]) -> dict[str, float]:
@@ -114,6 +130,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         rows = [measure(name, given.captures, given.preset, Path(folder), given.repeats) for name in given.cases or CASES]
     stem = HERE / f"accuracy-{given.preset}"
+    if stem.with_suffix(".json").exists():
+        before = {row["case"]: row for row in json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"]}
+        found = before | {row["case"]: row for row in rows}
+        rows = [found[name] for name in CASES if name in found]
     record = {"machine": machine(), "preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset} --repeats {given.repeats}"

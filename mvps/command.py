@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -85,6 +86,17 @@ def number_list(text: str) -> tuple[int, ...]:
     if not numbers or len(numbers) != text.count(",") + 1 or min(numbers) < 1:
         raise argparse.ArgumentTypeError(f"wanted numbers from 1, separated by commas, such as 1,5,9, given {text!r}")
     return numbers
+
+
+def positive(text: str) -> float:
+    """A finite number above zero."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"wanted a number above 0, given {text!r}")
+    return number
 
 
 def lights_argument(text: str) -> tuple[int, ...] | Mapping[str, tuple[int, ...]]:

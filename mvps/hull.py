@@ -11,9 +11,6 @@ the centres of its last foreground and its first background pixel, half a pixel 
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +19,7 @@ from scipy.optimize import linprog
 from skimage.measure import marching_cubes
 
 from mvps.camera import inside_image, pixel_footprint, project
+from mvps.cores import on_cores
 from mvps.mesh import largest_component
 from mvps.scene import Bool, Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
 
@@ -114,8 +112,7 @@ def _cut(capture: Capture, points: Float) -> NDArray[np.float32]:
         for view, field in zip(capture.views, fields, strict=True):
             np.maximum(distance[part], _distance(view, field, points[part]), out=distance[part])
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        list(pool.map(of_part, range(0, len(points), POINTS_PER_PART)))
+    on_cores(of_part, range(0, len(points), POINTS_PER_PART))
     return distance
 
 

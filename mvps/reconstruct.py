@@ -13,7 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mvps import __version__
-from mvps.command import lights_argument, number_list, parse, parser, run
+from mvps.command import lights_argument, number_list, parse, parser, positive, run
+from mvps.cores import on_cores
+from mvps.memory import keep_below
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
@@ -104,13 +106,9 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
 
 def photometric_stereo(capture: Capture, lights: Lights) -> tuple[NormalMap, ...]:
     """Photometric stereo of every view on its own, on all cores."""
-    import os
-    from concurrent.futures import ThreadPoolExecutor
-
     from mvps.photometric import normal_map
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return tuple(pool.map(normal_map, capture.views, lights.direction, lights.intensity))
+    return tuple(on_cores(normal_map, capture.views, lights.direction, lights.intensity))
 
 
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
@@ -348,6 +346,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--hold-out-lights", type=number_list, default=(), help="lights kept back for evaluation")
     made.add_argument("--calibrated-lights", action="store_true", help="use the lights given with the capture instead of solving them")
     made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
+    made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or refuse at the start")
     made.add_argument("--seed", type=int, default=0, help="of all random draws")
     given = parse(made, argv)
     settings = Settings(
@@ -363,9 +362,13 @@ def main(argv: Sequence[str]) -> None:
     )
     from mvps.load import read_calibrated_lights, read_capture
 
+    def before_decoding(sizes: list[tuple[int, int]]) -> None:
+        if given.max_memory is not None:
+            keep_below(given.max_memory, sizes, given.preset)
+
     progress = Progress()
     with progress.stage("load") as stage:
-        capture = read_capture(given.capture, given.views or None, given.lights or None)
+        capture = read_capture(given.capture, given.views or None, given.lights or None, before_decoding)
         stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     lights = read_calibrated_lights(given.capture, used) if given.calibrated_lights else None

@@ -20,7 +20,7 @@ from mvps.camera import view_directions
 from mvps.mesh import normalise
 from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
 from mvps.shading import shade
-from mvps.visibility import RayCaster, camera_hits, interpolate
+from mvps.visibility import RayCaster, camera_hits, interpolate, shadows
 
 SAMPLES_PER_CHUNK = 1 << 18
 
@@ -48,11 +48,7 @@ def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: 
 
 def shadow_at(caster: RayCaster, points: Points, lights: Float) -> Bool:
     """(n, lights) True where another part of the mesh hides the light (lights, 3) from the point."""
-    rows, columns = np.nonzero((points.mesh_normal @ lights.T > 0) & points.hit[:, None])
-    origins = points.position + caster.offset * points.mesh_normal
-    shadow = np.zeros((len(points.hit), len(lights)), bool)
-    shadow[rows, columns] = caster.occluded(origins[rows], lights[columns])
-    return shadow
+    return shadows(caster, points.position, points.mesh_normal, lights)
 
 
 class Arriving(NamedTuple):

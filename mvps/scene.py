@@ -196,7 +196,10 @@ class Capture:
         """The capture with only the views named in `keep`, each with only the lights of these numbers."""
         views = []
         for view in self.views:
-            if view.name in keep:
+            if view.name in keep and tuple(keep[view.name]) == view.lights:
+                # The samples are most of what the program holds: a copy only where something is left out.
+                views.append(view)
+            elif view.name in keep:
                 positions = [view.lights.index(number) for number in keep[view.name]]
                 views.append(replace(view, samples=view.samples[:, positions], lights=tuple(keep[view.name])))
         return Capture(self.name, tuple(views))

@@ -17,9 +17,7 @@ x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +27,7 @@ from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
+from mvps.cores import at_a_time, on_cores
 from mvps.mesh import face_areas, lengths, normalise, vertex_normals
 from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
@@ -209,10 +208,8 @@ def _photographed_albedo(
 
 def _on_all_cores(task: Callable[[int], Any], total: int) -> Iterator[Any]:
     """task(0), task(1) ... in this order, no more of them at a time than there are cores: numpy, torch and Embree release the lock."""
-    cores = len(os.sched_getaffinity(0))
-    with ThreadPoolExecutor(cores) as pool:
-        for start in range(0, total, cores):
-            yield from pool.map(task, range(start, min(start + cores, total)))
+    for start in range(0, total, at_a_time()):
+        yield from on_cores(task, range(start, min(start + at_a_time(), total)))
 
 
 def _away_from_border(view: View) -> Bool:

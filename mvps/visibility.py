@@ -6,8 +6,6 @@ surface only up to its own resolution, so nearer occluders are an artefact of th
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -17,6 +15,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from mvps.camera import pixel_centres, project, rays, view_directions
+from mvps.cores import on_cores
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Bool, Camera, Float, Int, Surface
 
@@ -85,8 +84,7 @@ def _in_chunks(query: Any, rays_total: int) -> list[Any]:
     slices = [slice(i, i + RAYS_PER_CALL) for i in range(0, rays_total, RAYS_PER_CALL)]
     if len(slices) < 2:
         return [query(s) for s in slices]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return list(pool.map(query, slices))
+    return on_cores(query, slices)
 
 
 def camera_hits(caster: RayCaster, camera: Camera, pixels: Int) -> Hits:
@@ -124,10 +122,17 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
     vertices (n,) indices; lights (lights, 3) unit, world, towards the light. Only lights above the horizon are traced: below it the
     shadow is attached, not cast.
     """
-    local = caster.vertex_normals[vertices]
-    lit = local @ lights.T > 0
-    rows, columns = np.nonzero(lit)
-    origins = (caster.surface.vertices[vertices] + caster.offset * local)[rows]
-    shadow = np.zeros(lit.shape, bool)
-    shadow[rows, columns] = caster.occluded(origins, lights[columns])
+    return shadows(caster, caster.surface.vertices[vertices], caster.vertex_normals[vertices], lights)
+
+
+def shadows(caster: RayCaster, points: Float, normal: Float, lights: Float) -> Bool:
+    """The same for points of the mesh (n, 3) with its unit normals there (n, 3); nothing hides a light from a point whose normal is 0."""
+    shadow = np.zeros((len(points), len(lights)), bool)
+    origins = points + caster.offset * normal
+    # A ray takes a hundred bytes on its way and one in the answer.
+    step = max(1, RAYS_PER_CALL // max(1, len(lights)))
+    for start in range(0, len(points), step):
+        part = slice(start, start + step)
+        rows, columns = np.nonzero(normal[part] @ lights.T > 0)
+        shadow[start + rows, columns] = caster.occluded(origins[part][rows], lights[columns])
     return shadow

@@ -17,14 +17,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from mvps.joint.blocks import WORKERS
+from mvps.cores import on_cores
 from mvps.joint.reflectance import Observed, chunks
 from mvps.joint.trial import parted
 from mvps.material import Trial, judged
@@ -64,11 +63,10 @@ def _sums(of: Observed, ratios: Sequence[Float]) -> _Sums:
 
     n = len(of.vertices.normal)
     total = _Sums(*(np.zeros(n) for _ in range(3)), *(np.zeros((n, 3)) for _ in range(3)))
-    with ThreadPoolExecutor(WORKERS) as pool:
-        for samples, part in zip(of.views, pool.map(of_view, range(len(of.views))), strict=True):
-            index = samples.vertex.cpu().numpy()
-            for whole, some in zip(total, part, strict=True):
-                whole[index] += some
+    for samples, part in zip(of.views, on_cores(of_view, range(len(of.views))), strict=True):
+        index = samples.vertex.cpu().numpy()
+        for whole, some in zip(total, part, strict=True):
+            whole[index] += some
     return total
 
 

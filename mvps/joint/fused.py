@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 
 from mvps.camera import bilinear, project, view_directions
-from mvps.joint.blocks import WORKERS
+from mvps.cores import on_cores
 from mvps.mesh import face_normals, lengths, normalise
 from mvps.scene import Capture, Float, Int, NormalMap, Surface
 
@@ -49,8 +47,7 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
         w = corners * photometric.confidence[positions] * cosine[:, None] ** 2
         return chosen, np.einsum("nkc,nk->nc", photometric.normal[positions], w)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
-        for chosen, summed in pool.map(of_view, range(len(capture.views))):
-            total[chosen] += summed
+    for chosen, summed in on_cores(of_view, range(len(capture.views))):
+        total[chosen] += summed
     known = lengths(total)[:, None] > LEAST_WEIGHT
     return np.where(known, normalise(total), normalise(otherwise[faces].sum(1)))

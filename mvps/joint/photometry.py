@@ -6,6 +6,7 @@ of every view's own pixels (pixels.py)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -19,7 +20,7 @@ from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
-from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
+from mvps.joint.observe import Streamed, ViewSamples, channel_ratio, gathering, observe, observing, with_gathered
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
@@ -181,16 +182,22 @@ def _sources(state: State, vertices: Vertices) -> Sources | None:
     return sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
 
 
+def _under_all_lights(state: State, capture: Capture, sources: Sources | None, device: torch.device) -> Streamed:
+    """The samples of all vertices under all lights, view by view."""
+    observed = observing(capture, state.surface, state.lights, device)
+    if sources is None:
+        return Streamed(observed, len(capture.views))
+    gathered = gathering(state.surface, sources, state.law.bounce, state.lights)
+    return Streamed(lambda i: gathered(i, observed(i)), len(capture.views))
+
+
 def photometric_round(
     state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
 ) -> dict[str, float]:
     """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
     device = task.device
 
-    def lit() -> tuple[Capture, Lights]:
-        return thinned(capture, state.lights) if task.thinned else (capture, state.lights)
-
-    part, part_lights = lit()
+    part, part_lights = thinned(capture, state.lights)
     state.views = observe(part, state.surface, part_lights, device)
     mesh_normal = vertex_normals(state.surface)
     vertices = _started(state, part, part_lights, mesh_normal, carried, device)
@@ -221,15 +228,20 @@ def photometric_round(
     solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
     moved = light_change(state.lights, solved)
     state.lights = solved
-    lights = grey_lights(lit()[1], device)
+    lights = grey_lights(thinned(capture, state.lights)[1], device)
     vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, 1, 0)
     last = vertices.normal
-    vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, 0, 1)
+    full: Sequence[ViewSamples] = state.views
+    if not task.thinned and part is not capture:
+        full = _under_all_lights(state, capture, _sources(state, vertices), device)
+        lights = grey_lights(state.lights, device)
+    vertices = vertex_step(full, vertices, lights, state.law, free)
     state.vertices = vertices
     state.lights = _with_colours(state, capture, few, some)
-    state.under = part, part_lights = lit()
+    state.under = thinned(capture, state.lights)
+    of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))
-    state.maps = all_pixel_normals(part, state.surface, material, part_lights, _sources(state, vertices), task.half)
+    state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, _sources(state, vertices), task.half)
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None

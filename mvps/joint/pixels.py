@@ -7,8 +7,6 @@ first hit.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 
 from mvps.bounce import Sources, at, gathered
 from mvps.camera import view_directions
+from mvps.cores import on_cores
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_steps
@@ -110,5 +109,4 @@ def all_pixel_normals(
         of_view = capture.views[i], caster, sources, material, lights.direction[i], lights.intensity[i]
         return pixel_normals(*of_view, quick[i], every_other)
 
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        return tuple(pool.map(one, range(len(capture.views))))
+    return tuple(on_cores(one, range(len(capture.views))))

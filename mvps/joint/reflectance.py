@@ -11,14 +11,14 @@ is linear in g and in r, which are solved in turn as robust ratios of sums. One 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import bilinear, project
-from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, evaluate, robust
+from mvps.cores import on_cores
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, robust
 from mvps.joint.observe import ViewSamples
 from mvps.scene import Capture, Float, Int, Law, Surface
 
@@ -90,8 +90,7 @@ def _sums(of: Observed, i: int, ratio: NDArray[np.float32], colour: NDArray[np.f
 
 
 def _all_sums(of: Observed, ratios: list[Float], colour: NDArray[np.float32]) -> list[_Sums]:
-    with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(lambda i: _sums(of, i, ratios[i].astype(np.float32), colour), range(len(of.views))))
+    return on_cores(lambda i: _sums(of, i, ratios[i].astype(np.float32), colour), range(len(of.views)))
 
 
 def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:

@@ -9,6 +9,7 @@ The same step serves pixels of one view in the place of vertices (pixels.py).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,7 +91,7 @@ def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> 
 
 
 def vertex_step(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, stated: bool = True
+    views: Sequence[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, stated: bool = True
 ) -> Vertices:
     """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed. stated: and sigma, a fifth of the time."""
     equations = vertex_equations(views, vertices, lights, law)

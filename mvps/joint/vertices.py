@@ -18,7 +18,6 @@ radians, a the mean area of a vertex (normals are independent from vertex to ver
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -28,6 +27,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mvps.camera import project, view_directions
+from mvps.cores import on_cores
 from mvps.joint.blocks import WORKERS
 from mvps.mesh import face_areas, face_normals, vertex_normals
 from mvps.scene import Capture, Float, Int, NormalMap, Surface, View
@@ -104,8 +104,7 @@ def agreement(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], s
         cosine = _facing(view, surface.vertices[index], normal[index])
         weights_sum[index] += cosine
         weights_squared[index] += cosine**2
-    with ThreadPoolExecutor(WORKERS) as pool:
-        total, first, second = (sum(parts) for parts in zip(*pool.map(swept, range(WORKERS)), strict=True))
+    total, first, second = (sum(parts) for parts in zip(*on_cores(swept, range(WORKERS)), strict=True))
     mean = first / np.maximum(total, 1e-9)[..., None]
     views = weights_sum**2 / np.maximum(weights_squared, 1e-12)
     # The variance of n samples about their own mean is short of the true one by (n - 1) / n.

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,12 +29,14 @@ def read_capture(
     path: str | Path,
     views: Sequence[int] | None = None,
     lights: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
+    before_decoding: Callable[[list[tuple[int, int]]], None] | None = None,
 ) -> Capture:
     """A capture in the layout of DiLiGenT-MV, foreground pixels only, views and lights in ascending order of their numbers.
 
     views   numbers of the views to read, counted from 1 as in the folders' names; None: all
     lights  numbers of the photographs to read, counted from 1 in the order of filenames.txt or of the files' names, for all
             views or by view name (every view read must then be named); None: all
+    before_decoding is called with every view's numbers of foreground pixels and lights, while nothing large is held yet
 
     Samples are the file's code values: scale is 1 / 255 or 1 / 65535; for saturation see `clip_level`.
     Raises CaptureError, with the file, what was wanted, what was given and what to try, about everything that is wrong.
@@ -51,6 +53,8 @@ def read_capture(
                 wanted = f"{first.header.width} x {first.header.height} pixels as in {first.folder.name}, because one KK serves all views"
                 given = f"{plan.header.width} x {plan.header.height}"
                 raise complaint(plan.folder, wanted, given, "restore the original size or store one KK_i per view")
+    if before_decoding is not None:
+        before_decoding([(int(plan.mask.sum()), len(plan.lights)) for plan in plans])
     samples = _decode_all(plans)
     deep = [s for s, plan in zip(samples, plans, strict=True) if plan.header.bits == 16]
     saturation = {8: 255, 16: clip_level(histogram(deep))}

@@ -1,0 +1,32 @@
+"""How much is worked on at a time: one thing to a core, and fewer where memory is short.
+
+Every view (or half of them) that is worked on holds arrays of its own, so their number at a time decides how much memory is held beyond
+what the photographs and the mesh need. No value depends on it: results come in order.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+Result = TypeVar("Result")
+
+_most = [len(os.sched_getaffinity(0))]
+
+
+def at_a_time() -> int:
+    """Things that are worked on at a time: the number of cores, unless `work_on` set less."""
+    return _most[0]
+
+
+def work_on(most: int) -> None:
+    """No more than `most` things at a time from now on, in this process; at least one, no more than cores."""
+    _most[0] = max(1, min(most, len(os.sched_getaffinity(0))))
+
+
+def on_cores(task: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
+    """[task(first arguments), task(second ones) ...] on all cores: numpy, torch and Embree release the interpreter's lock."""
+    with ThreadPoolExecutor(at_a_time()) as pool:
+        return list(pool.map(task, *arguments))

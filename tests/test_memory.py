@@ -1,0 +1,92 @@
+"""A limit of memory: what it allows, what it refuses, and that a run obeys it without other values."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mvps import cores, reconstruct
+from mvps.command import run
+from mvps.cores import at_a_time, on_cores, work_on
+from mvps.load import read_capture
+from mvps.memory import keep_below, peak_bytes
+from mvps.scene import CaptureError
+from mvps.synthetic.files import write_capture
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+SIZES = [(50_000, 96)] * 19 + [(60_000, 96)]
+
+
+@pytest.fixture(autouse=True)
+def four_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(cores.os, "sched_getaffinity", lambda _: set(range(4)))
+    work_on(4)
+    yield
+    monkeypatch.undo()
+    work_on(len(os.sched_getaffinity(0)))
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("capture") / "small"
+    write_capture(*render_capture(SceneSettings(views=8, lights=10, size=96)), folder)
+    return folder
+
+
+@pytest.mark.parametrize("views", [1, 2, 3, 4])
+def test_as_many_views_at_a_time_as_the_limit_allows(views: int) -> None:
+    keep_below(peak_bytes(SIZES, "standard", views) / 1e9 + 1e-6, SIZES, "standard")
+    assert at_a_time() == views
+
+
+def test_more_than_enough_memory_changes_nothing() -> None:
+    keep_below(1000, SIZES, "fine")
+    assert at_a_time() == 4
+
+
+def test_a_limit_that_cannot_be_kept_is_refused_with_one_that_can() -> None:
+    with pytest.raises(CaptureError, match=r"20 views of up to 96 lights .* given 1; use") as refused:
+        keep_below(1, SIZES, "standard")
+    keep_below(float(str(refused.value).split("at least ")[1].split()[0]), SIZES, "standard")
+    assert at_a_time() >= 1
+
+
+def test_results_come_in_order_whatever_the_number_at_a_time() -> None:
+    for most in (1, 3):
+        work_on(most)
+        assert on_cores(lambda a, b: a - b, range(9), range(0, 18, 2)) == [-k for k in range(9)]
+
+
+def test_a_refused_limit_ends_before_photographs_are_decoded(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvps.load.diligent.decode", lambda *_: pytest.fail("decoded"))
+    assert run(reconstruct.main, [str(capture), "--out", str(tmp_path / "r"), "--max-memory", "0.1", "--quiet"]) == 2
+    assert run(reconstruct.main, [str(capture), "--out", str(tmp_path / "r"), "--max-memory", "-3", "--quiet"]) == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+IN_A_PROCESS_OF_ITS_OWN = """
+import sys
+from mvps import reconstruct
+from mvps.command import run
+from mvps.progress import peak_memory_mb
+code = run(reconstruct.main, sys.argv[1:])
+print(peak_memory_mb())
+sys.exit(code)
+"""
+
+
+def test_a_limit_is_obeyed_and_changes_no_value(capture: Path, tmp_path: Path) -> None:
+    sizes = [(len(view.pixels), len(view.lights)) for view in read_capture(capture).views]
+    limits = {"one": peak_bytes(sizes, "draft", 1) / 1e9 + 1e-6, "free": 100.0}
+    for name, limit in limits.items():
+        options = [str(capture), "--out", str(tmp_path / name), "--preset", "draft", "--quiet", "--max-memory", str(limit)]
+        done = subprocess.run([sys.executable, "-c", IN_A_PROCESS_OF_ITS_OWN, *options], capture_output=True, text=True, check=True)
+        assert float(done.stdout.splitlines()[-1]) < 1000 * limit
+    for file in ("mesh.ply", "material.npz", "lights.json"):
+        assert (tmp_path / "one" / file).read_bytes() == (tmp_path / "free" / file).read_bytes()
