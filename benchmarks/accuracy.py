@@ -2,9 +2,10 @@
 
     python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard] [--repeats 3]
 
-CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures; `large` is made
-for the purpose where it is not there, and thrown away. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file, where cases of earlier runs stay: errors against ground truth
-(which the reconstruction never reads), seconds of the whole command, and its largest resident set, with the machine named.
+CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures; `large` is made for the purpose
+where it is not there, and thrown away. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file, where cases of earlier runs
+stay: errors against ground truth (which the reconstruction never reads), seconds of the whole command, and its largest resident set,
+with the machine named.
 """
 
 from __future__ import annotations

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from mvps import cores, reconstruct
+from mvps import cores, memory, reconstruct
 from mvps.command import run
 from mvps.cores import at_a_time, on_cores, work_on
 from mvps.load import read_capture
-from mvps.memory import keep_below, peak_bytes
+from mvps.memory import keep_below, likely_vertices, peak_bytes, room_for
 from mvps.scene import CaptureError
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
@@ -26,6 +26,7 @@ SIZES = [(50_000, 96)] * 19 + [(60_000, 96)]
 @pytest.fixture(autouse=True)
 def four_cores(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(cores.os, "sched_getaffinity", lambda _: set(range(4)))
+    monkeypatch.setattr(memory, "_limit", [])
     work_on(4)
     yield
     monkeypatch.undo()
@@ -41,7 +42,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("views", [1, 2, 3, 4])
 def test_as_many_views_at_a_time_as_the_limit_allows(views: int) -> None:
-    keep_below(peak_bytes(SIZES, "standard", views) / 1e9 + 1e-6, SIZES, "standard")
+    keep_below(peak_bytes(SIZES, likely_vertices(SIZES, "standard"), views) / 1e9 + 1e-6, SIZES, "standard")
     assert at_a_time() == views
 
 
@@ -55,6 +56,16 @@ def test_a_limit_that_cannot_be_kept_is_refused_with_one_that_can() -> None:
         keep_below(1, SIZES, "standard")
     keep_below(float(str(refused.value).split("at least ")[1].split()[0]), SIZES, "standard")
     assert at_a_time() >= 1
+
+
+def test_a_mesh_that_is_larger_than_expected_leaves_fewer_views_or_is_refused() -> None:
+    vertices = likely_vertices(SIZES, "standard")
+    room_for(1e9)
+    keep_below(peak_bytes(SIZES, vertices, 4) / 1e9 + 1e-6, SIZES, "standard")
+    room_for(vertices + 1)
+    assert at_a_time() == 3
+    with pytest.raises(CaptureError, match="mesh of about"):
+        room_for(3 * vertices)
 
 
 def test_results_come_in_order_whatever_the_number_at_a_time() -> None:
@@ -83,7 +94,7 @@ sys.exit(code)
 
 def test_a_limit_is_obeyed_and_changes_no_value(capture: Path, tmp_path: Path) -> None:
     sizes = [(len(view.pixels), len(view.lights)) for view in read_capture(capture).views]
-    limits = {"one": peak_bytes(sizes, "draft", 1) / 1e9 + 1e-6, "free": 100.0}
+    limits = {"one": peak_bytes(sizes, 3 * likely_vertices(sizes, "draft"), 1) / 1e9 + 1e-6, "free": 100.0}
     for name, limit in limits.items():
         options = [str(capture), "--out", str(tmp_path / name), "--preset", "draft", "--quiet", "--max-memory", str(limit)]
         done = subprocess.run([sys.executable, "-c", IN_A_PROCESS_OF_ITS_OWN, *options], capture_output=True, text=True, check=True)

@@ -25,6 +25,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.steps import stated_confidence
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.material import Trial
+from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
@@ -168,6 +169,7 @@ def refine(
     while pending:
         round_settings = pending.pop(0)
         state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
+        room_for(len(state.surface.vertices))
         if creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
