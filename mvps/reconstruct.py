@@ -346,7 +346,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--hold-out-lights", type=number_list, default=(), help="lights kept back for evaluation")
     made.add_argument("--calibrated-lights", action="store_true", help="use the lights given with the capture instead of solving them")
     made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
-    made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or refuse at the start")
+    made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or end with what it takes")
     made.add_argument("--seed", type=int, default=0, help="of all random draws")
     given = parse(made, argv)
     settings = Settings(
