@@ -5,48 +5,30 @@ At depth z_i a pixel covers z_i / f_i world units, so
 
     d(x) = max_i m_i(x) z_i / f_i
 
-is zero on the hull and a lower bound of the distance near it (Laurentini 1994 for the hull). A mask's boundary runs between
-the centres of its last foreground and its first background pixel, half a pixel from either.
+is zero on the hull and a lower bound of the distance near it (Laurentini 1994 for the hull).
 """
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter
 from scipy.optimize import linprog
 from skimage.measure import marching_cubes
 
 from mvps.camera import inside_image, pixel_footprint, project
 from mvps.cores import on_cores
 from mvps.mesh import largest_component
-from mvps.scene import Bool, Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
+from mvps.scene import Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
+from mvps.silhouette import mask_distance, sampled
 
 MARGIN_CELLS = 3
 """Cells of free space kept around the hull, so that the level set closes inside the grid."""
-
-STAIRCASE_PIXELS = 1.0
-"""Standard deviation, pixels, that smooths the distance to a binary mask: its boundary is a staircase of one-pixel steps. A straight
-boundary stays where it is; one of radius r pixels moves by 1 / (2 r) pixels."""
-
-REMAP_LIMIT = 1 << 14
-"""Points per call of cv2.remap, which takes no side longer than a signed 16-bit integer."""
 
 POINTS_PER_PART = 1 << 15
 """Points handled at once: their arrays stay in the processor's cache."""
 
 MINIMUM_CELLS_ACROSS = 8
 """A hull thinner than this many coarse cells is no solid that masks could have made."""
-
-
-def mask_distance(mask: Bool) -> NDArray[np.float32]:
-    """(height, width) signed distance in pixels from pixel centres to the mask's boundary, negative inside."""
-    # scipy rather than OpenCV, whose blur and distance differ in the last bits from call to call.
-    inside, outside = distance_transform_edt(mask), distance_transform_edt(~mask)
-    signed = np.where(mask, 0.5 - inside, outside - 0.5)
-    smooth: NDArray[np.float32] = gaussian_filter(signed, STAIRCASE_PIXELS, mode="nearest").astype(np.float32)
-    return smooth
 
 
 def bounds(capture: Capture) -> tuple[Float, Float]:
@@ -89,12 +71,7 @@ def bounds(capture: Capture) -> tuple[Float, Float]:
 def _distance(view: View, field: NDArray[np.float32], points: Float) -> NDArray[np.float32]:
     """Signed distance of world points (n, 3) to one view's silhouette cone, world units, -inf where the view cannot tell."""
     image, depth = project(view.camera, points)
-    image = image.astype(np.float32)
-    pixels = np.empty(len(image), np.float32)
-    for start in range(0, len(image), REMAP_LIMIT):
-        part = image[start : start + REMAP_LIMIT]
-        x, y = part[None, :, 0] - 0.5, part[None, :, 1] - 0.5
-        pixels[start : start + len(part)] = cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    pixels = sampled(field, image)
     # Beyond the image nothing was photographed: such points are outside, at least by their distance to the image.
     outside = ~inside_image(view.camera, image)
     limit = np.array([view.camera.width, view.camera.height])

@@ -9,10 +9,11 @@ import pytest
 from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
-from mvps.hull import bounds, default_cells, mask_distance, signed_distance, visual_hull
+from mvps.hull import bounds, default_cells, signed_distance, visual_hull
 from mvps.mesh import normalise
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
+from mvps.silhouette import mask_distance
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -235,7 +235,7 @@ def test_fusing_true_normals_and_positions_mends_a_dented_sphere() -> None:
     sigma = np.full(len(outward), 0.1)
     # A tenth of the positions are wrong, a tenth unknown.
     offset[::10], sigma[5::10] = 3.0, np.inf
-    mended = fuse(dented, normalise(outward[dented.faces].sum(1)), Agreement(offset, sigma), 0.02, 0.05)[0]
+    mended = fuse(dented, normalise(outward[dented.faces].sum(1)), Agreement(offset, sigma), 0.02)[0]
     error = np.abs(np.linalg.norm(mended.vertices, axis=1) - RADIUS)
     assert error.mean() < 0.3 * np.abs(dents).mean()
 

@@ -23,11 +23,12 @@ from mvps.joint.photometry import TRIAL_VERTICES, WEAK_TIE, State, Task, drawn, 
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.joint.steps import stated_confidence
-from mvps.joint.vertices import Agreement, agreement, fuse
+from mvps.joint.vertices import Agreement, agreement, fuse, with_masks
 from mvps.material import Trial
 from mvps.memory import room_for
-from mvps.mesh import edges, isotropic_remesh, split_edges, vertex_normals
+from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
+from mvps.silhouette import mask_distance
 
 NORMAL_SIGMA = 0.03
 """Standard deviation of the views' normals, radians, in the fusion with positions: half of all pixels are better than 1 to 2 degrees."""
@@ -35,7 +36,9 @@ NORMAL_SIGMA = 0.03
 POSITION_FLOOR_PIXELS = 0.05
 """Smallest standard deviation of an agreed position: neighbouring costs share their pixels, so their agreement looks better than it is."""
 
-FUSIONS = 2
+FUSIONS = 3
+"""Of a round. Faces turn and move, so that other pixels speak for them, and a hollow is dug a part at a time: from where a fusion put the
+surface, views agree deeper (docs/method.md)."""
 
 STILL_DEG = 0.25
 """Mean turn of the lights in their last Gauss-Newton step below which they have settled: near a minimum steps at least halve, so that all
@@ -109,21 +112,22 @@ def chosen_device(device: str) -> str:
 
 
 def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], reach: Float, pixel: float) -> Surface:
-    """The surface moved to where views agree, with their normals. otherwise (V, 3): normals where no view sees; reach: offsets, pixels."""
-    if min(len(view.lights) for view in capture.views) < OWN_LIGHTS:
-        # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
-        agreed = Agreement(np.zeros(len(surface.vertices)), np.full(len(surface.vertices), pixel))
-    else:
-        agreed = agreement(capture, surface, state.maps, seen, reach * pixel)
-    # Faces turn and move, so that other pixels speak for them: twice.
-    factor = None
+    """The surface moved to where views and masks agree, with the views' normals. otherwise (V, 3): normals where no view sees; reach:
+    offsets, pixels."""
+    floor = POSITION_FLOOR_PIXELS * pixel
+    distance = [mask_distance(view.mask) for view in capture.views]
+    factor, start = None, surface.vertices
     for _ in range(FUSIONS):
-        outward = vertex_normals(surface)
+        if min(len(view.lights) for view in capture.views) < OWN_LIGHTS:
+            # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
+            back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
+            agreed = Agreement(back, np.full(len(back), pixel))
+        else:
+            agreed = agreement(capture, surface, state.maps, seen, reach * pixel)
+        agreed = with_masks(agreed, capture, surface, distance, floor)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
-        moved, factor = fuse(surface, target, agreed, NORMAL_SIGMA, POSITION_FLOOR_PIXELS * pixel, factor)
-        agreed = Agreement(agreed.offset - ((moved.vertices - surface.vertices) * outward).sum(1), agreed.sigma)
-        surface = moved
-    return surface
+        surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
+    return unbiased(surface)
 
 
 def _remeshed(

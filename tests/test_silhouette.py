@@ -1,0 +1,92 @@
+"""Masks and outlines: where they are, and how an outline moves with the mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+from sphere_scene import RADIUS, camera_at, make_sphere
+
+from mvps.camera import project, rays
+from mvps.joint.refine import POSITION_FLOOR_PIXELS
+from mvps.joint.vertices import Agreement, with_masks
+from mvps.mesh import normalise, unbiased
+from mvps.scene import Camera, Surface
+from mvps.silhouette import mask_distance, outline, sampled
+from mvps.visibility import RayCaster
+
+BALL = make_sphere(5).reconstruction.surface
+CAMERA = camera_at(np.array([1.0, 0.3, 0.2]), 200)
+
+
+def traced(surface: Surface, camera: Camera, image: np.ndarray, outward: np.ndarray) -> np.ndarray:
+    """(n,) how far from image points along `outward` rays still meet the mesh, pixels, by bisection."""
+    caster = RayCaster(surface)
+    low, high = np.full(len(image), -2.0), np.full(len(image), 2.0)
+    for _ in range(22):
+        middle = (low + high) / 2
+        met = caster.occluded(*rays(camera, image + middle[:, None] * outward))
+        low, high = np.where(met, middle, low), np.where(met, high, middle)
+    return low
+
+
+def test_the_outline_lies_where_rays_begin_to_miss() -> None:
+    line = outline(RayCaster(BALL), CAMERA)
+    assert np.abs(traced(BALL, CAMERA, line.image, line.outward)).max() < 0.1
+    assert np.allclose(line.barycentric.sum(1), 1) and (line.barycentric >= 0).all()
+    centres = project(CAMERA, np.einsum("nk,nkc->nc", line.barycentric, BALL.vertices[BALL.faces[line.face]]))[0]
+    assert np.abs(centres - line.image).max() < 0.01
+    # A circle, once around; its zigzag over the faces makes it a little longer.
+    radius = np.linalg.norm(line.image - 100, axis=1).mean()
+    assert 1 < line.length.sum() / (2 * np.pi * radius) < 1.1
+
+
+def test_gradient_of_silhouette_edge() -> None:
+    """Vertices move along their normals by a smooth field: the outline moves as its derivative says, against central differences of
+    the traced silhouette."""
+    line, normal = outline(RayCaster(BALL), CAMERA), normalise(BALL.vertices)
+    by = np.sin(BALL.vertices @ np.array([0.05, 0.08, -0.06]))
+    step = 0.2
+    ends = [traced(Surface(BALL.vertices + s * step * by[:, None] * normal, BALL.faces), CAMERA, line.image, line.outward) for s in (1, -1)]
+    measured = (ends[0] - ends[1]) / (2 * step)
+    said = line.rate * (line.barycentric * by[BALL.faces[line.face]]).sum(1)
+    assert np.abs(measured - said).max() < 0.05 * line.rate.max()
+    assert np.corrcoef(measured, said)[0, 1] > 0.999
+
+
+def test_an_outline_hidden_or_in_front_of_the_object_is_none() -> None:
+    """A small ball in front of a large one, and one behind it."""
+    toward = normalise(CAMERA.centre)
+    parts = [BALL.vertices, 0.2 * BALL.vertices + 70 * toward, 0.2 * BALL.vertices - 70 * toward]
+    n = len(BALL.vertices)
+    three = Surface(np.concatenate(parts), np.concatenate([BALL.faces + k * n for k in range(3)]))
+    line = outline(RayCaster(three), CAMERA)
+    assert len(line.face) > 100 and line.face.max() < len(BALL.faces)
+
+
+def test_masks_bring_a_ball_to_its_size() -> None:
+    scene = make_sphere(5)
+    for factor in (0.98, 1.02):
+        wrong = Surface(factor * BALL.vertices, BALL.faces)
+        nothing = Agreement(np.zeros(len(BALL.vertices)), np.full(len(BALL.vertices), np.inf))
+        told = with_masks(nothing, scene.capture, wrong, [mask_distance(view.mask) for view in scene.capture.views], POSITION_FLOOR_PIXELS)
+        known = np.isfinite(told.sigma)
+        assert known.sum() > 300 and abs(told.offset[known].mean() - (1 - factor) * RADIUS) < 0.1
+        assert np.abs(told.offset[known] - (1 - factor) * RADIUS).max() < 0.6
+
+
+def test_distances_between_pixel_centres() -> None:
+    mask = np.zeros((40, 60), bool)
+    mask[:, :30] = True
+    image = np.column_stack([np.linspace(25, 35, 21), np.full(21, 20.0)])
+    assert np.abs(sampled(mask_distance(mask), image) - (image[:, 0] - 30)).max() < 0.05
+
+
+def test_unbiased_faces_lie_on_a_ball_in_the_mean() -> None:
+    rng = np.random.default_rng(0)
+
+    def mean_radius(surface: Surface) -> float:
+        shares = rng.dirichlet(np.ones(3), len(surface.faces))
+        return float(np.linalg.norm(np.einsum("fk,fkc->fc", shares, surface.vertices[surface.faces]), axis=1).mean())
+
+    coarse = make_sphere(3).reconstruction.surface
+    before, after = RADIUS - mean_radius(coarse), RADIUS - mean_radius(unbiased(coarse))
+    assert before > 0.1 and abs(after) < 0.1 * before
