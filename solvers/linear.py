@@ -26,6 +26,11 @@ class CholeskyLike:
     def __init__(self, matrix: sp.spmatrix) -> None:
         self._factor = spl.splu(sp.csc_matrix(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
 
+    def solve(self, right: NDArray[Any]) -> NDArray[np.float64]:
+        """x (n, k) with A x = right (n, k)."""
+        x: NDArray[np.float64] = self._factor.solve(np.ascontiguousarray(right, dtype=np.float64))
+        return x
+
     def nearby(self, matrix: sp.spmatrix, right: NDArray[Any], start: NDArray[Any]) -> NDArray[np.float64]:
         """x (n, k) with matrix x = right (n, k) for a matrix near the factored one, from `start` (n, k); one too far is factored."""
         x = np.array(start, dtype=np.float64)
@@ -46,5 +51,5 @@ class CholeskyLike:
             before = np.maximum(now, np.finfo(np.float64).tiny)
         else:
             # Not so near after all: the matrix's own factor.
-            x = CholeskyLike(matrix)._factor.solve(np.ascontiguousarray(right, dtype=np.float64))
+            x = CholeskyLike(matrix).solve(right)
         return x

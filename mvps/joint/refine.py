@@ -23,6 +23,7 @@ from mvps.joint.photometry import TRIAL_VERTICES, WEAK_TIE, State, Task, drawn, 
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.joint.steps import stated_confidence
+from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Agreement, agreement, fuse, with_masks
 from mvps.material import Trial
 from mvps.memory import room_for
@@ -112,8 +113,8 @@ def chosen_device(device: str) -> str:
 
 
 def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], reach: Float, pixel: float) -> Surface:
-    """The surface moved to where views and masks agree, with the views' normals. otherwise (V, 3): normals where no view sees; reach:
-    offsets, pixels."""
+    """The surface moved to where views and masks agree, with the views' normals; what no view sees follows smoothly. otherwise (V, 3):
+    normals where no view sees; reach: offsets, pixels."""
     floor = POSITION_FLOOR_PIXELS * pixel
     distance = [mask_distance(view.mask) for view in capture.views]
     factor, start = None, surface.vertices
@@ -127,7 +128,9 @@ def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, s
         agreed = with_masks(agreed, capture, surface, distance, floor)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
-    return unbiased(surface)
+    known = np.zeros(len(surface.vertices), bool)
+    known[np.concatenate(seen)] = True
+    return closed_over(unbiased(surface), known, capture, distance)
 
 
 def _remeshed(
