@@ -5,7 +5,8 @@
     lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
-                             grazing, bounce (numbers)
+                             grazing, bounce (numbers); with a neural residual also residual_share (V,), residual_code (V, codes),
+                             residual_weight_K (out, in) and residual_bias_K (out,) of its layers K = 0, 1, ...
     normals/NAME.npy, .png   (height, width, 3) float32 world frame, NaN outside the mask; the picture shows (normal + 1) / 2
     report.html              where one is given
     metrics.json, settings.json
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -29,7 +31,7 @@ from mvps.folders import appearing_whole
 from mvps.gltf import glb_bytes
 from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
 from mvps.pbr import reflectance_scale, srgb_bytes
-from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Surface
+from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
 from mvps.texture import Textures, png_bytes
 
 RESULT_MARKS = ("settings.json", "mesh.ply")
@@ -77,7 +79,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
     try:
         with np.load(folder / "material.npz") as arrays:
             values = {name: arrays[name] for name in _MATERIAL} | {name: float(arrays[name]) for name in _OF_ALL}
-            material = Material(normal=mesh.normals, **values)
+            material = Material(normal=mesh.normals, **values, residual=_residual(arrays))
         return Reconstruction(
             surface=Surface(mesh.vertices, mesh.faces),
             material=material,
@@ -98,6 +100,24 @@ def read_reconstruction(folder: Path) -> Reconstruction:
 
 _MATERIAL = ("albedo", "specular_weight", "sharpness", "confidence")
 _OF_ALL = ("grazing", "bounce")
+
+
+def _residual(arrays: Mapping[str, Any]) -> Residual | None:
+    """The neural residual in material.npz; None where there is none."""
+    if "residual_share" not in arrays:
+        return None
+    layers = range(sum(name.startswith("residual_weight_") for name in arrays))
+    pairs = tuple((arrays[f"residual_weight_{k}"], arrays[f"residual_bias_{k}"]) for k in layers)
+    return Residual(arrays["residual_share"], arrays["residual_code"], pairs)
+
+
+def _residual_arrays(residual: Residual | None) -> dict[str, Any]:
+    if residual is None:
+        return {}
+    arrays: dict[str, Any] = {"residual_share": residual.share, "residual_code": residual.code}
+    for k, (weight, bias) in enumerate(residual.layers):
+        arrays |= {f"residual_weight_{k}": weight, f"residual_bias_{k}": bias}
+    return arrays
 
 
 def normal_picture(normals: Float) -> Any:
@@ -147,7 +167,8 @@ def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
     colours = srgb_bytes(material.albedo / scale)
     mesh = PlyMesh(surface.vertices, material.normal, colours, surface.faces)
     arrays = io.BytesIO()
-    np.savez(arrays, allow_pickle=False, **{name: getattr(material, name) for name in _MATERIAL + _OF_ALL})
+    values = {name: getattr(material, name) for name in _MATERIAL + _OF_ALL} | _residual_arrays(material.residual)
+    np.savez(arrays, allow_pickle=False, **values)
     comment = f"colour = sRGB of albedo / {scale:.9g}; the normal is the refined shading normal"
     return {"mesh.ply": ply_bytes(mesh, comment), "material.npz": arrays.getvalue()}
 

@@ -291,6 +291,7 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
         "sharpness": list(refined.law.sharpness),
         "grazing": refined.law.grazing,
         "bounce": refined.law.bounce,
+        "share_with_neural_residual": 0.0 if refined.material.residual is None else float(refined.material.residual.share.mean()),
     }
     return Reconstruction(
         refined.surface,

@@ -1,8 +1,8 @@
 """Photographs of a reconstruction: first hits, interpolated material, the image model, cast shadows.
 
-    image(pixel, light) = intensity * (shade(material at the first hit) * (1 - cast_shadow) + albedo * bounce * G)
+    image(pixel, light) = intensity * (shade(material at the first hit) * residual * (1 - cast_shadow) + albedo * bounce * G)
 
-G is the light that other surfaces send (bounce.py).
+G is the light that other surfaces send (bounce.py), residual the factor of a material that has a neural residual (neural.py).
 
 The shading normal is the material's refined normal; shadows are traced on the mesh.
 """
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mvps.bounce import Sources, at, coarse_sources, gathered
 from mvps.camera import view_directions
 from mvps.mesh import normalise
+from mvps.neural import factor
 from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
 from mvps.shading import shade
 from mvps.visibility import RayCaster, camera_hits, interpolate, shadows
@@ -26,7 +27,8 @@ SAMPLES_PER_CHUNK = 1 << 18
 
 
 class Points(NamedTuple):
-    """Surface points under n pixels: position, normal, albedo (n, 3), specular_weight (n, lobes[, 3]), confidence (n,), hit (n,)."""
+    """Surface points under n pixels: position, normal, albedo (n, 3), specular_weight (n, lobes[, 3]), confidence (n,), hit (n,);
+    share (n,) and code (n, codes) of the neural residual, (n, 0) where there is none."""
 
     position: Float
     mesh_normal: Float
@@ -35,6 +37,8 @@ class Points(NamedTuple):
     specular_weight: Float
     confidence: Float
     hit: Bool
+    share: Float
+    code: Float
 
 
 def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: Int) -> Points:
@@ -43,7 +47,11 @@ def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: 
     hits = camera_hits(caster, camera, pixels)
     values = (surface.vertices, caster.vertex_normals, material.normal, material.albedo, material.specular_weight, material.confidence)
     position, mesh_normal, normal, albedo, weight, confidence = (interpolate(surface, hits, v) for v in values)
-    return Points(position, normalise(mesh_normal), normalise(normal), albedo, weight, confidence, hits.face >= 0)
+    residual = material.residual
+    nothing: Float = np.zeros((len(material.albedo), 0))
+    of_vertices = (nothing, nothing) if residual is None else (residual.share, residual.code)
+    share, code = (interpolate(surface, hits, v) for v in of_vertices)
+    return Points(position, normalise(mesh_normal), normalise(normal), albedo, weight, confidence, hits.face >= 0, share, code)
 
 
 def shadow_at(caster: RayCaster, points: Points, lights: Float) -> Bool:
@@ -117,6 +125,9 @@ def photograph(
         normal, towards, albedo, weight = (torch.tensor(a[part], dtype=torch.float32) for a in arrays)
         shaded = shade(normal, towards, light, albedo, weight, material.law).numpy()
         image[part] = shaded * lit[part, :, None]
+        if material.residual is not None:
+            of_points = (points.share[part], points.code[part], points.normal[part], view[part])
+            image[part] *= factor(material.residual, *of_points, direction)[..., None]
         if arriving is not None:
             image[part] += points.albedo[part, None].astype(np.float32) * arriving.at(points.position[part], points.mesh_normal[part])
     return image * intensity.astype(np.float32)

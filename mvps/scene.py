@@ -267,6 +267,32 @@ class Law:
 
 
 @dataclass(frozen=True, eq=False)
+class Residual:
+    """The neural residual of the reflectance (neural.py).
+
+    share   (V,) 1 on the vertices that have one, 0 on the others
+    code    (V, codes) what the network knows of a vertex
+    layers  weights (out, in) and biases (out,), the last with one output
+    """
+
+    share: NDArray[np.float32]
+    code: NDArray[np.float32]
+    layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "share", checked("residual share", self.share, (None,), np.float32))
+        object.__setattr__(self, "code", checked("residual code", self.code, (len(self.share), None), np.float32))
+        layers, width = [], None
+        for weight, bias in self.layers:
+            weight = checked("residual weights", weight, (None, width), np.float32)
+            width = len(weight)
+            layers.append((weight, checked("residual biases", bias, (width,), np.float32)))
+        if width != 1:
+            raise ValueError(f"residual: wanted layers that end in one output, given {width or 'none'}")
+        object.__setattr__(self, "layers", tuple(layers))
+
+
+@dataclass(frozen=True, eq=False)
 class Material:
     """Reflectance on the vertices of a surface.
 
@@ -276,6 +302,7 @@ class Material:
     sharpness        (lobes,) of exp(sharpness * (half . normal - 1)), positive
     confidence       (V,) in the normal (RELIABLE); 0 where no photograph saw the vertex
     grazing, bounce  as in `Law`
+    residual         of the reflectance, where albedo and lobes fit badly; None where there is none
     """
 
     normal: Float
@@ -285,6 +312,7 @@ class Material:
     confidence: Float
     grazing: float = 0.0
     bounce: float = 0.0
+    residual: Residual | None = None
 
     @property
     def law(self) -> Law:
@@ -303,6 +331,8 @@ class Material:
         _unit("normal", self.normal)
         if (self.albedo < 0).any() or (self.specular_weight < 0).any():
             raise ValueError("material: wanted non-negative albedo and specular_weight, given a negative one")
+        if self.residual is not None and len(self.residual.share) != n:
+            raise ValueError(f"residual: wanted {n} vertices, given {len(self.residual.share)}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,15 +39,20 @@ FAR_OFF = 0.05
 """Radians between mesh and refined normal beyond which the mesh's normal is an outlier rather than noise."""
 
 
-def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen: Tensor) -> tuple[list[ViewSamples], Vertices, Anchor]:
-    """The same problem on the chosen vertices only."""
+def on_some(views: list[ViewSamples], vertices: Vertices, chosen: Tensor) -> tuple[list[ViewSamples], Vertices]:
+    """Samples and state of the chosen vertices only, which are numbered anew."""
     place = torch.full((len(vertices.normal),), -1, dtype=torch.long, device=chosen.device)
     place[chosen] = torch.arange(len(chosen), device=chosen.device)
     few = []
     for s in views:
         rows = torch.nonzero(place[s.vertex] >= 0)[:, 0]
         few.append(replace(s.of_pairs(rows), vertex=place[s.vertex[rows]]))
-    state = Vertices(vertices.normal[chosen], vertices.reflectance[chosen], vertices.scale[chosen])
+    return few, Vertices(vertices.normal[chosen], vertices.reflectance[chosen], vertices.scale[chosen])
+
+
+def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen: Tensor) -> tuple[list[ViewSamples], Vertices, Anchor]:
+    """The same problem on the chosen vertices only."""
+    few, state = on_some(views, vertices, chosen)
     tie = Anchor(anchor.normal[chosen], anchor.sigma, anchor.reflectance[chosen], anchor.reflectance_sigma[chosen])
     return few, state, tie
 

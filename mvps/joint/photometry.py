@@ -247,7 +247,7 @@ def photometric_round(
     assert vertices.sigma is not None
     stated = np.degrees(vertices.sigma.cpu().numpy()[seen])
     return {
-        "residual": relative_residual(state.views, vertices),
+        "residual": float(relative_residuals(state.views, vertices).nanmedian()),
         "light_change_deg": moved[0],
         "intensity_change": moved[1],
         "normal_change_deg": float(np.mean(turned)),
@@ -266,8 +266,8 @@ def grey_albedo(vertices: Vertices) -> Float:
     return albedo.double().cpu().numpy()[:, None].repeat(3, axis=1)
 
 
-def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
-    """Median over vertices of the residuals' standard deviation over the root mean square of the vertex's samples."""
+def relative_residuals(views: list[ViewSamples], vertices: Vertices) -> torch.Tensor:
+    """(V,) the residuals' standard deviation over the root mean square of the vertex's samples; NaN without samples."""
     square = torch.zeros_like(vertices.scale)
     weight = torch.zeros_like(vertices.scale)
     for samples in views:
@@ -277,7 +277,9 @@ def relative_residual(views: list[ViewSamples], vertices: Vertices) -> float:
             weight.index_add_(0, samples.vertex[part], data.sum(1))
     seen = weight > 0
     level = (square[seen] / weight[seen]).sqrt().clamp_min(1e-12)
-    return float((vertices.scale[seen] / level).median())
+    relative = torch.full_like(vertices.scale, torch.nan)
+    relative[seen] = vertices.scale[seen] / level
+    return relative
 
 
 def material_of(state: State, albedo: Float) -> Material:

@@ -18,8 +18,20 @@ from mvps.camera import pixel_footprint
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
 from mvps.joint.fused import face_targets
+from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
-from mvps.joint.photometry import TRIAL_VERTICES, WEAK_TIE, State, Task, drawn, grey_albedo, grey_lights, material_of, photometric_round
+from mvps.joint.photometry import (
+    TRIAL_VERTICES,
+    WEAK_TIE,
+    State,
+    Task,
+    drawn,
+    grey_albedo,
+    grey_lights,
+    material_of,
+    photometric_round,
+    relative_residuals,
+)
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.joint.steps import stated_confidence
@@ -28,7 +40,7 @@ from mvps.joint.vertices import Agreement, agreement, fuse, with_masks
 from mvps.material import Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
-from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
+from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Residual, Surface
 from mvps.silhouette import mask_distance
 
 NORMAL_SIGMA = 0.03
@@ -209,6 +221,7 @@ def _finished(
     assert state.vertices is not None and state.under is not None
     albedo, coloured_lobes = grey_albedo(state.vertices), False
     tint: Float = np.ones(3)
+    residual: Residual | None = None
     if in_colour:
         photographs, lights = state.under
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
@@ -217,9 +230,11 @@ def _finished(
             state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
             coloured_lobes = state.trials[-1].kept
         albedo, tint = colours(observed, ratios, coloured_lobes)
+        trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
+        state.trials.append(trial)
     pairs = torch.from_numpy(edges(state.surface)).to(device)
     stated = stated_confidence(state.vertices, WEAK_TIE, pairs).double().cpu().numpy()
-    material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0))
+    material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0), residual=residual)
     if coloured_lobes:
         material = replace(material, specular_weight=material.specular_weight[..., None] * tint)
     status, text = _verdict(account)
