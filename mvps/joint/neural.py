@@ -201,7 +201,7 @@ def _errors(table: _Table, predicted: Tensor, vertices: int) -> Float:
 
 def neural_residual(of: Observed, relative: Tensor, poor: float, generator: np.random.Generator) -> tuple[Trial, Residual | None]:
     """The trial of the residual on the vertices whose relative residual (V,), NaN without samples, is above `poor`, and the residual itself
-    where it is kept. None is tried where the median is not: there such vertices are edges and seams, not a reflectance (docs/method.md)."""
+    where it is kept. None is tried where the median is not above `poor`: there views held out gained nothing (docs/method.md)."""
     start = time.perf_counter()
     bad = torch.nonzero(relative > poor)[:, 0]
     if not float(relative.nanmedian()) > poor or len(bad) < LEAST_VERTICES:
