@@ -165,8 +165,7 @@ def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: 
         weights, pulls = (np.bincount(corners, values.ravel(), count) for values in (shares, shares * wanted[:, None]))
         return weights.astype(np.float64), pulls.astype(np.float64)
 
-    with ThreadPoolExecutor(WORKERS) as pool:
-        weight, pull = (sum(parts) for parts in zip(*pool.map(of_view, range(len(capture.views))), strict=True))
+    weight, pull = (sum(parts) for parts in zip(*on_cores(of_view, range(len(capture.views))), strict=True))
     known = np.isfinite(agreed.sigma)
     own = np.where(known, 1 / np.maximum(agreed.sigma, floor) ** 2, 0)
     total = own + weight
