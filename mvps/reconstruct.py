@@ -61,7 +61,7 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     shallow hollows."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    fused = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(3.0, 3.0, 0.5, photometric=False))
+    fused = (RoundSettings(3.0, 4.0, 0.5, photometric=False),)
     return RefineSettings(
         (*fused, RoundSettings(2.0 if final else 3.0, 2.0, 0.4)), free_lights=free_lights, final=final, for_field=not final
     )

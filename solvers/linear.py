@@ -13,7 +13,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
-TOLERANCE = 1e-6
+TOLERANCE = 1e-5
 """Of the residual in `nearby`, relative: on a mesh of 66 000 vertices the solution is then 1e-4 pixels off at most."""
 
 MOST_STEPS = 100

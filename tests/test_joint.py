@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_derivatives, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
-from mvps.joint.observe import Streamed, ViewSamples, observe
+from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.steps import free_reflectance, stated_confidence, vertex_step
@@ -121,23 +120,6 @@ def test_normal_equations_do_not_depend_on_which_thread_was_faster(scene: Sphere
     views, truth, lights, law = problem(scene)
     first, second = (vertex_equations(views, truth, lights, law).hessian for _ in range(2))
     assert torch.equal(first, second)
-
-
-def test_samples_made_view_by_view_say_the_same_and_are_let_go(scene: SphereScene) -> None:
-    views, truth, lights, law = problem(scene)
-    made: list[weakref.ref[ViewSamples]] = []
-    most = 0
-
-    def make(i: int) -> ViewSamples:
-        nonlocal most
-        samples = replace(views[i])
-        made.append(weakref.ref(samples))
-        most = max(most, sum(ref() is not None for ref in made))
-        return samples
-
-    kept, streamed = (vertex_equations(of, truth, lights, law) for of in (views, Streamed(make, len(views))))
-    assert torch.equal(kept.hessian, streamed.hessian) and torch.equal(kept.gradient, streamed.gradient)
-    assert len(made) == len(views) > 2 >= most
 
 
 def turned(lights: list[DirectionalLights], by: float) -> list[DirectionalLights]:

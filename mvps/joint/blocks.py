@@ -20,7 +20,6 @@ small operations.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -173,16 +172,12 @@ def robust(residual: Tensor, scale: Tensor) -> Tensor:
     return 1 / (1 + (residual / (CAUCHY_95 * scale[:, None])) ** 2)
 
 
-def _vertex_equations(
-    views: Sequence[ViewSamples], own: range, vertices: Vertices, lights: list[DirectionalLights], law: Law
-) -> NormalEquations:
-    """Those of the `own` ones of the views."""
+def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
     n, p = len(vertices.normal), 2 + vertices.reflectance.shape[1]
     # One product of (jacobian, residual) with itself holds hessian, gradient and squares.
     sums, count = vertices.normal.new_zeros(n, p + 1, p + 1), vertices.normal.new_zeros(n)
     first, second = tangents(vertices.normal)
-
-    def add(samples: ViewSamples, of_view: DirectionalLights) -> None:
+    for samples, of_view in zip(views, lights, strict=True):
         for part in samples.chunks():
             index, towards = samples.vertex[part], samples.towards[part]
             shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
@@ -191,21 +186,17 @@ def _vertex_equations(
             rows = torch.stack([*vertex_derivatives(shaded, (first[index], second[index]), towards, of_view), residual], 1)
             sums.index_add_(0, index, (rows * weight[:, None]) @ rows.transpose(1, 2))
             count.index_add_(0, index, weight.sum(1))
-
-    # Samples that are made when they are asked for (observe.py) are let go before the next view's.
-    for i in own:
-        add(views[i], lights[i])
     return NormalEquations(sums[:, :p, :p].contiguous(), sums[:, :p, p].contiguous(), sums[:, p, p].contiguous(), count)
 
 
-def vertex_equations(views: Sequence[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
+def vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
     """Normal equations of every vertex at the current state, unknowns as in `vertex_derivatives`.
 
     The views are dealt out to the cores in a fixed order and their sums added in that order, so that the result does not
     depend on which core was faster.
     """
     hands = min(WORKERS, len(views))
-    parts = on_cores(lambda k: _vertex_equations(views, range(k, len(views), hands), vertices, lights, law), range(hands))
+    parts = on_cores(lambda k: _vertex_equations(views[k::hands], vertices, lights[k::hands], law), range(hands))
     total = parts[0]
     for part in parts[1:]:
         total = NormalEquations(

@@ -12,9 +12,8 @@ mask's boundary, where pixels mix object and background.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -125,24 +124,8 @@ def visible_in(capture: Capture, surface: Surface) -> list[tuple[Int, Float]]:
     return [_pairs(view, caster)[:2] for view in capture.views]
 
 
-class Streamed(Sequence[ViewSamples]):
-    """The samples of all views, each made when it is asked for and held by whoever asked: all vertices under all lights are too many to
-    keep for a single pass."""
-
-    def __init__(self, make: Callable[[int], ViewSamples], count: int) -> None:
-        self._make, self._count = make, count
-
-    def __len__(self) -> int:
-        return self._count
-
-    def __getitem__(self, i: Any) -> Any:
-        return self._make(i)
-
-
-def observing(
-    capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None
-) -> Callable[[int], ViewSamples]:
-    """What gives the samples of view i on the vertices of `surface`, or on those `among` (V,); visibility and cast shadows are traced."""
+def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None) -> list[ViewSamples]:
+    """The samples of all views on the vertices of `surface`, or on those `among` (V,); visibility and cast shadows are traced anew."""
     caster = RayCaster(surface)
 
     def one(i: int) -> ViewSamples:
@@ -159,25 +142,15 @@ def observing(
             torch.from_numpy(usable & ~shadow).to(device),
         )
 
-    return one
-
-
-def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None) -> list[ViewSamples]:
-    """The samples of all views (`observing`)."""
-    return on_cores(observing(capture, surface, lights, device, among), range(len(capture.views)))
-
-
-def gathering(surface: Surface, sources: Sources, bounce: float, lights: Lights) -> Callable[[int, ViewSamples], ViewSamples]:
-    """What gives view i's samples together with what other surfaces send to them, for the law's bounce and the lights."""
-    weight = interpolation(sources.of, surface.vertices, vertex_normals(surface))
-
-    def one(i: int, samples: ViewSamples) -> ViewSamples:
-        values = weight[samples.vertex.cpu().numpy()] @ gathered(sources, lights.direction[i], bounce)
-        return replace(samples, gathered=torch.from_numpy(values).to(samples.image.device))
-
-    return one
+    return on_cores(one, range(len(capture.views)))
 
 
 def with_gathered(views: list[ViewSamples], surface: Surface, sources: Sources, bounce: float, lights: Lights) -> list[ViewSamples]:
-    """The samples of all views with what other surfaces send (`gathering`)."""
-    return on_cores(gathering(surface, sources, bounce, lights), range(len(views)), views)
+    """The samples with what other surfaces send to them, for the law's bounce and the lights."""
+    weight = interpolation(sources.of, surface.vertices, vertex_normals(surface))
+
+    def one(i: int) -> ViewSamples:
+        values = weight[views[i].vertex.cpu().numpy()] @ gathered(sources, lights.direction[i], bounce)
+        return replace(views[i], gathered=torch.from_numpy(values).to(views[i].image.device))
+
+    return on_cores(one, range(len(views)))

@@ -6,7 +6,6 @@ of every view's own pixels (pixels.py)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -20,11 +19,11 @@ from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
-from mvps.joint.observe import Streamed, ViewSamples, channel_ratio, gathering, observe, observing, with_gathered
+from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
-from mvps.joint.thinned import kept, thinned
+from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose
 from mvps.mesh import angles_deg, mean_edge_length, normalise, vertex_normals
@@ -65,8 +64,8 @@ class State:
 @dataclass(frozen=True)
 class Task:
     """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; sharpen: and solve the lobes'
-    sharpness; thinned: vertices and pixels under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device of the
-    tensors."""
+    sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device:
+    of the tensors."""
 
     free_lights: bool
     choose: bool
@@ -182,15 +181,6 @@ def _sources(state: State, vertices: Vertices) -> Sources | None:
     return sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
 
 
-def _under_all_lights(state: State, capture: Capture, sources: Sources | None, device: torch.device) -> Streamed:
-    """The samples of all vertices under all lights, view by view."""
-    observed = observing(capture, state.surface, state.lights, device)
-    if sources is None:
-        return Streamed(observed, len(capture.views))
-    gathered = gathering(state.surface, sources, state.law.bounce, state.lights)
-    return Streamed(lambda i: gathered(i, observed(i)), len(capture.views))
-
-
 def photometric_round(
     state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
 ) -> dict[str, float]:
@@ -210,32 +200,30 @@ def photometric_round(
     if state.coarse is None:
         state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
 
-    def with_sources(views: list[ViewSamples], lights: Lights) -> list[ViewSamples]:
-        sources = _sources(state, vertices)
+    def with_sources(views: list[ViewSamples], lights: Lights, sources: Sources | None) -> list[ViewSamples]:
         return views if sources is None else with_gathered(views, state.surface, sources, state.law.bounce, lights)
 
     if task.choose and not state.trials:
         tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
         trial = drawn(few, TRIAL_VERTICES, generator)
-        lobes = _choose_model(state, capture, with_sources(few, state.lights), vertices, tie, trial, task.sharpen)
+        lobes = _choose_model(
+            state, capture, with_sources(few, state.lights, _sources(state, vertices)), vertices, tie, trial, task.sharpen
+        )
         vertices = replace(vertices, reflectance=vertices.reflectance[:, [0, *(1 + k for k in lobes)]])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
-    before, lights, keep = vertices.normal, grey_lights(part_lights, device), kept([len(view.lights) for view in part.views])
-    vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, MATERIAL_STEPS if carried is None else CARRIED_STEPS, 0)
-    state.views = with_sources(state.views, part_lights)
-    few = state.views if part is capture else with_sources(few, state.lights)
+    before, lights = vertices.normal, grey_lights(part_lights, device)
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS)
+    sources = _sources(state, vertices)
+    state.views = with_sources(state.views, part_lights, sources)
+    few = state.views if part is capture else with_sources(few, state.lights, sources)
     free = with_population(vertices, free)
     solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
-    vertices = vertex_steps(state.views, vertices, lights, state.law, free, keep, 1, 0)
+    vertices = vertex_step(state.views, vertices, lights, state.law, free, stated=False)
     last = vertices.normal
-    full: Sequence[ViewSamples] = state.views
-    if not task.thinned and part is not capture:
-        full = _under_all_lights(state, capture, _sources(state, vertices), device)
-        lights = grey_lights(state.lights, device)
-    vertices = vertex_step(full, vertices, lights, state.law, free)
+    vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
     state.lights = _with_colours(state, capture, few, some)
     state.under = thinned(capture, state.lights)

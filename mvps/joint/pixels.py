@@ -18,7 +18,7 @@ from mvps.camera import view_directions
 from mvps.cores import on_cores
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
-from mvps.joint.steps import Anchor, confidence, vertex_steps
+from mvps.joint.steps import Anchor, confidence, vertex_step
 from mvps.joint.thinned import kept
 from mvps.mesh import normalise
 from mvps.rendering import points_under, shadow_at
@@ -85,7 +85,9 @@ def pixel_normals(
     anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
     lights = [DirectionalLights(light, torch.tensor(intensity.mean(1), dtype=torch.float32))]
     state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
-    state = vertex_steps([samples], state, lights, material.law, anchor, [quick], QUICK_STEPS, 1)
+    for _ in range(QUICK_STEPS):
+        state = vertex_step([samples.of_lights(quick)], state, [lights[0].of(quick)], material.law, anchor, stated=False)
+    state = vertex_step([samples], state, lights, material.law, anchor)
     towards = -view.camera.rotation[2].astype(np.float32)
     pixels = len(view.pixels)
     normals = np.tile(towards, (pixels, 1))

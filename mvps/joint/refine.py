@@ -89,9 +89,9 @@ class RoundSettings:
 @dataclass(frozen=True)
 class RefineSettings:
     """rounds: in order; free_lights: solve the lights; final: this is the result, so the components of the reflectance model are chosen by
-    held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the last round uses all
-    lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, and draws fewer rays than
-    there are pixels, so the last round leaves the surface and half of the pixels."""
+    held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
+    last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, and
+    draws fewer rays than there are pixels, so the last round leaves the surface and half of the pixels."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True

@@ -9,7 +9,6 @@ The same step serves pixels of one view in the place of vertices (pixels.py).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,7 +90,7 @@ def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> 
 
 
 def vertex_step(
-    views: Sequence[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, stated: bool = True
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, stated: bool = True
 ) -> Vertices:
     """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed. stated: and sigma, a fifth of the time."""
     equations = vertex_equations(views, vertices, lights, law)
@@ -109,25 +108,11 @@ def vertex_step(
 
 
 def vertex_steps(
-    views: list[ViewSamples],
-    vertices: Vertices,
-    lights: list[DirectionalLights],
-    law: Law,
-    anchor: Anchor,
-    keep: list[slice],
-    quick: int,
-    full: int,
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, steps: int
 ) -> Vertices:
-    """`quick` steps under the lights of each view to `keep` (thinned.py), then `full` ones under all; sigma as of the last."""
-    if quick and any(rows.step > 1 for rows in keep):
-        some = [samples.of_lights(rows) for samples, rows in zip(views, keep, strict=True)]
-        of_some = [of_view.of(rows) for of_view, rows in zip(lights, keep, strict=True)]
-    else:
-        some, of_some = views, lights
-    for k in range(quick):
-        vertices = vertex_step(some, vertices, of_some, law, anchor, stated=not full and k == quick - 1)
-    for k in range(full):
-        vertices = vertex_step(views, vertices, lights, law, anchor, stated=k == full - 1)
+    """So many steps; sigma as of the last."""
+    for k in range(steps):
+        vertices = vertex_step(views, vertices, lights, law, anchor, stated=k == steps - 1)
     return vertices
 
 

@@ -41,7 +41,7 @@ from solvers.linear import CholeskyLike
 MINIMUM_VIEWS = 1.5
 """Effective number of views, (sum w)^2 / sum w^2, from which their agreement says something."""
 
-SWEEPS = 3
+SWEEPS = 2
 """Reweightings of the agreed positions in a fusion. Five views, fusions of the last round: 2 of them 0.148 px, 3 0.145, 5 0.143."""
 
 FAR_OFF = 3.0
