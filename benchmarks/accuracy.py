@@ -33,6 +33,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     "bunny-4-lights": ("bunny", ["--lights", "1,11,21,32"]),
     "bunny-1-light-a-view": ("bunny", ["--lights", "ONE_LIGHT"]),
     "bunny-held-out-views": ("bunny", ["--hold-out-views", "4,8,12,16,20"]),
+    "buddha-held-out-views": ("buddha", ["--hold-out-views", "4,8,12,16,20"]),
     "large": ("large", []),
 }
 """Name: capture and options of mvps.reconstruct. ONE_LIGHT stands for a file that gives view k light 1 + 7 k mod 32."""

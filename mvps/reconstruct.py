@@ -78,9 +78,14 @@ def last_pass(preset: str, free_lights: bool) -> RefineSettings:
     """Rounds after Stage I; edges in pixels, sweeps reach as far as Stage I may be off."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
+    first = RoundSettings(1.5, 1.2, 0.3, crease=0.1, fusions=5)
     rounds = {
-        "standard": (RoundSettings(1.5, 1.2, 0.3, crease=0.1), RoundSettings(1.5, 1.2, 0.3, crease=0.1, for_detail=True)),
-        "fine": (RoundSettings(1.0, 1.2, 0.3), RoundSettings(0.8, 1.2, 0.3, crease=0.2), RoundSettings(0.8, 0.6, 0.2, crease=0.1)),
+        "standard": (first, replace(first, for_detail=True)),
+        "fine": (
+            RoundSettings(1.0, 1.2, 0.3, fusions=5),
+            RoundSettings(0.8, 1.2, 0.3, crease=0.2, fusions=5),
+            RoundSettings(0.8, 0.6, 0.2, crease=0.1, fusions=5),
+        ),
     }[preset]
     return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)
 

@@ -49,10 +49,6 @@ NORMAL_SIGMA = 0.03
 POSITION_FLOOR_PIXELS = 0.05
 """Smallest standard deviation of an agreed position: neighbouring costs share their pixels, so their agreement looks better than it is."""
 
-FUSIONS = 3
-"""Of a round. Faces turn and move, so that other pixels speak for them, and a hollow is dug a part at a time: from where a fusion put the
-surface, views agree deeper (docs/method.md)."""
-
 STILL_DEG = 0.25
 """Mean turn of the lights in their last Gauss-Newton step below which they have settled: near a minimum steps at least halve, so that all
 further ones together are no longer than this."""
@@ -72,7 +68,8 @@ POOR_FIT = 0.1
 class RoundSettings:
     """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
     lights and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge
-    before it is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY)."""
+    before it is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY); fusions: faces turn and move, so
+    that other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows."""
 
     edge: float
     reach: float
@@ -80,6 +77,7 @@ class RoundSettings:
     photometric: bool = True
     crease: float = np.inf
     for_detail: bool = False
+    fusions: int = 3
 
     def offsets(self) -> Float:
         """Offsets of the sweep, pixels."""
@@ -124,19 +122,21 @@ def chosen_device(device: str) -> str:
     return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
 
 
-def _moved(surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], reach: Float, pixel: float) -> Surface:
+def _moved(
+    surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
+) -> Surface:
     """The surface moved to where views and masks agree, with the views' normals; what no view sees follows smoothly. otherwise (V, 3):
-    normals where no view sees; reach: offsets, pixels."""
+    normals where no view sees."""
     floor = POSITION_FLOOR_PIXELS * pixel
     distance = [mask_distance(view.mask) for view in capture.views]
     factor, start = None, surface.vertices
-    for _ in range(FUSIONS):
+    for _ in range(settings.fusions):
         if min(len(view.lights) for view in capture.views) < OWN_LIGHTS:
             # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
             back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
             agreed = Agreement(back, np.full(len(back), pixel))
         else:
-            agreed = agreement(capture, surface, state.maps, seen, reach * pixel)
+            agreed = agreement(capture, surface, state.maps, seen, settings.offsets() * pixel)
         agreed = with_masks(agreed, capture, surface, distance, floor)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
@@ -202,7 +202,7 @@ def refine(
             seen, changes = [index for index, _ in visible_in(capture, state.surface)], {}
         moved = state.surface
         if not leaves_surface:
-            moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings.offsets(), pixel)
+            moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings, pixel)
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
         state.surface = moved
