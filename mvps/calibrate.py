@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.cores import on_cores
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
@@ -191,7 +192,7 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int) -> Calibr
     if min(counts) < MINIMUM_LIGHTS:
         scaled = [_from_normals(sample) for sample in samples]
         return Calibration(_assemble(capture, scaled, False), float("nan"), float("nan"))
-    separate = [factorise(s.image, s.known, 3, floor=s.noise) for s in samples]
+    separate = on_cores(lambda s: factorise(s.image, s.known, 3, floor=s.noise), samples)
     residual = float(np.sqrt(np.mean([f.residual**2 for f in separate])))
     fourth = float(np.mean([f.singular_values[3] for f in separate]))
     if len(capture.views) > 1 and len(counts) == 1 and len({view.lights for view in capture.views}) == 1:
@@ -210,7 +211,7 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int) -> Calibr
 
 
 def _assemble(capture: Capture, scaled: list[Float], one_rig: bool) -> Lights:
-    ratios = [colour_ratios(view) for view in capture.views]
+    ratios = on_cores(colour_ratios, capture.views)
     if one_rig:
         mean = np.mean(ratios, axis=0)
         ratios = [mean] * len(ratios)

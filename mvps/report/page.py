@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.cores import on_cores
 from mvps.rendering import light_sources
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
@@ -146,8 +147,8 @@ def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
         return ""
     caster, sources = RayCaster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
     parts = []
-    for view in views:
-        light, pictures = view_pictures(caster, sources, reconstruction, view)
+    shown = on_cores(lambda view: view_pictures(caster, sources, reconstruction, view), views)
+    for view, (light, pictures) in zip(views, shown, strict=True):
         figures = "".join(
             f'<figure><img src="{data_address(p.image)}" width="{p.image.shape[1]}" height="{p.image.shape[0]}"'
             f' alt="{escape(p.text)}"><figcaption>{escape(p.title)}</figcaption></figure>'
