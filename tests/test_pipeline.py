@@ -108,11 +108,14 @@ def test_the_frame_and_the_unit_of_the_world_do_not_matter(
 ) -> None:
     elsewhere = reconstructed(moved(capture, tmp_path / "capture", rotation, shift, unit), tmp_path / "result")
     here, there = read_reconstruction(result), read_reconstruction(elsewhere)
-    # Grids lie along other axes, so meshes differ in their vertices but not in what they show; what no view saw has no figure.
+    # Grids lie along other axes, so meshes differ in their vertices but not in what they show.
     back = (there.surface.vertices / unit - shift) @ rotation
-    apart, _ = distance_to(back[there.material.confidence > 0.5], here.surface)
+    apart, _ = distance_to(back, here.surface)
     span = np.ptp(here.surface.vertices, axis=0).max()
-    assert np.median(apart) < 0.001 * span and np.quantile(apart, 0.99) < 0.01 * span
+    seen, unseen = apart[there.material.confidence > 0.5], apart[there.material.confidence == 0]
+    assert np.median(seen) < 0.001 * span and np.quantile(seen, 0.99) < 0.01 * span
+    # What no view saw is bent over from the rim of what was seen: 0.0015 and 0.016 measured.
+    assert np.median(unseen) < 0.005 * span and unseen.max() < 0.03 * span
     for a, b in zip(here.lights.direction, there.lights.direction, strict=True):
         assert np.degrees(np.arccos(np.clip((a * (b @ rotation)).sum(1), -1, 1))).max() < 0.6
     difference = [(a * (b @ rotation)).sum(-1) for a, b in zip(here.normal_maps, there.normal_maps, strict=True)]
