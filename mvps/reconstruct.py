@@ -33,6 +33,10 @@ TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
 
+GOOD_HULL = 0.2
+"""Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
+captures, docs/method.md), so it would do no better."""
+
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
 long as the residual falls."""
@@ -141,9 +145,10 @@ def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed:
         return calibration.lights
 
 
-def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySettings, progress: Progress) -> Surface:
-    """The occupancy field under the progress bar."""
+def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySettings, progress: Progress, words: str = "") -> Surface:
+    """The occupancy field under the progress bar; words: its status."""
     with progress.stage("occupancy field", total=plan.steps) as stage:
+        stage.status(words)
         return field.trained(maps, plan, lambda _, loss: stage.advance(1, loss=loss))
 
 
@@ -152,14 +157,20 @@ def shaped(
 ) -> tuple[Surface, Refined, list[dict[str, float]]]:
     """Stage I and a round of Stage II on its surface in turn; Stage I's last surface, what Stage II last made, and its rounds.
 
-    Normals carve the field's hollows, and in a better carved hollow normals and lights are better.
+    Normals carve the field's hollows, and in a better carved hollow normals and lights are better. A hull that is good enough stays.
     """
     from mvps.joint.refine import POOR_FIT
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
 
-    plan = OccupancySettings()
+    rounds, shift = list(rough.rounds), rough.rounds[0]["vertex_change_px"]
+    words = f"views moved the hull by {shift:.2f} px"
+    if shift < GOOD_HULL:
+        with progress.stage("occupancy field") as stage:
+            stage.status(f"skipped: {words}, less than {GOOD_HULL} px")
+        return rough.surface, rough, rounds
+    plan, refined, carried = OccupancySettings(), rough, None
     field = Occupancy(capture, grid, plan, settings.seed)
-    surface, refined, rounds, carried = stage_one(field, rough.maps, plan, progress), rough, list(rough.rounds), None
+    surface = stage_one(field, rough.maps, plan, progress, words)
     for _ in range(MOST_TURNS):
         of_turn = between_passes(free_lights)
         refined = stage_two(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,22 +36,30 @@ def colours(points: np.ndarray) -> np.ndarray:
     return np.where(points[..., :1] < 0, LEFT, RIGHT)
 
 
-def make_sphere(
-    subdivisions: int = 4, coloured_lobes: bool = False, seed: int = 0, tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> SphereScene:
-    """Six views along the axes, ten lights of one rig; the refined normals are waves on the sphere's, up to about 10 degrees off.
+AXES = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
-    tint: colour of the lobes where they are coloured.
+
+def make_sphere(
+    subdivisions: int = 4,
+    coloured_lobes: bool = False,
+    seed: int = 0,
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    seen_from: Sequence[Sequence[float]] = AXES,
+    waves: float = 0.1,
+) -> SphereScene:
+    """Views from these directions, ten lights of one rig; the refined normals are waves on the sphere's, up to about 10 degrees off.
+
+    tint: colour of the lobes where they are coloured; waves: radians.
     """
     rng = np.random.default_rng(seed)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
     surface = Surface(np.array(ball.vertices), np.array(ball.faces))
     outward = normalise(surface.vertices)
-    waves = 0.1 * np.sin(surface.vertices[:, [1, 2, 0]] / 8)
+    shift = waves * np.sin(surface.vertices[:, [1, 2, 0]] / 8)
     weight = np.full((len(outward), 2), 0.15)
     weight = weight[..., None] * np.array(tint) if coloured_lobes else weight
-    material = Material(normalise(outward + waves), colours(surface.vertices), weight, np.array([12.0, 60.0]), np.ones(len(outward)))
-    cameras = [camera_at(np.array(d, float)) for d in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))]
+    material = Material(normalise(outward + shift), colours(surface.vertices), weight, np.array([12.0, 60.0]), np.ones(len(outward)))
+    cameras = [camera_at(np.array(d, float)) for d in seen_from]
     tilt = rng.normal(0, 0.5, (10, 2))
     rig = normalise(np.concatenate([tilt, -np.ones((10, 1))], 1))
     intensity = rng.uniform(0.6, 1.4, (10, 3))
@@ -70,7 +79,7 @@ def make_sphere(
     reconstruction = Reconstruction(
         surface,
         material,
-        Lights(tuple(directions), (intensity,) * 6, True),
+        Lights(tuple(directions), (intensity,) * len(cameras), True),
         tuple(view.name for view in views),
         tuple(view.lights for view in views),
         tuple(maps),

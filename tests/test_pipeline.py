@@ -10,12 +10,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.io
+from sphere_scene import RADIUS, make_sphere
 
 from mvps import evaluate, reconstruct
+from mvps.camera import pixel_footprint
 from mvps.command import run
 from mvps.export import read_reconstruction
 from mvps.measures import distance_to
 from mvps.occupancy import CONTINUED, OccupancySettings
+from mvps.progress import Progress
 from mvps.reconstruct import MOST_TURNS, Settings, shaped
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
@@ -122,6 +125,19 @@ def test_the_frame_and_the_unit_of_the_world_do_not_matter(
     assert np.degrees(np.arccos(np.clip(np.nanmedian(np.concatenate([d.ravel() for d in difference])), -1, 1))) < 0.6
 
 
+def test_a_hull_that_is_good_enough_goes_without_the_occupancy_field() -> None:
+    """Of a ball, twelve views make a hull that is off by a fifth of a pixel. With the field its radius came out 0.034 px off."""
+    along, around = 1 - (2 * np.arange(12) + 1) / 12, np.pi * (1 + 5**0.5) * (np.arange(12) + 0.5)
+    aside = np.sqrt(1 - along**2)
+    scene = make_sphere(5, seen_from=np.stack([aside * np.cos(around), aside * np.sin(around), along], 1).tolist(), waves=0)
+    progress = Progress()
+    found = reconstruct.reconstruct(scene.capture, Settings("ball"), None, progress)
+    (field,) = (stage for stage in progress.stages if stage["name"] == "occupancy field")
+    assert field["status"].startswith("skipped: views moved the hull by 0.")
+    pixel = pixel_footprint([view.camera for view in scene.capture.views], np.zeros(3))
+    assert np.abs(np.linalg.norm(found.surface.vertices, axis=1) - RADIUS).mean() < 0.1 * pixel
+
+
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
     out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9")
     found = figures(out, capture)
@@ -169,9 +185,9 @@ def test_stage_one_and_two_take_turns_while_the_model_fits_badly(
     trained: list[int] = []
 
     def refined(residual: float) -> SimpleNamespace:
-        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, rounds=[{"residual": residual}])
+        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, rounds=[{"residual": residual, "vertex_change_px": 1.0}])
 
-    def one(_: object, __: object, plan: OccupancySettings, ___: object) -> None:
+    def one(_: object, __: object, plan: OccupancySettings, *___: object) -> None:
         trained.append(plan.steps)
 
     monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined(next(made)))
