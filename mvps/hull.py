@@ -24,9 +24,6 @@ from mvps.silhouette import mask_distance, sampled
 MARGIN_CELLS = 3
 """Cells of free space kept around the hull, so that the level set closes inside the grid."""
 
-FINER = 4
-"""Cells of the final grid along one of those that find out where it is needed."""
-
 POINTS_PER_PART = 1 << 15
 """Points handled at once: their arrays stay in the processor's cache."""
 
@@ -107,38 +104,23 @@ def _grid_points(origin: Float, spacing: float, shape: tuple[int, int, int]) -> 
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
 
-def _sample(masks: _Masks, low: Float, high: Float, cells: int, margin: int) -> SignedDistanceGrid:
+def _sample(masks: _Masks, low: Float, high: Float, cells: int) -> SignedDistanceGrid:
     spacing = float((high - low).max()) / cells
-    origin = low - margin * spacing
-    nx, ny, nz = (int(n) + 2 * margin + 1 for n in np.ceil((high - low) / spacing))
+    origin = low - MARGIN_CELLS * spacing
+    nx, ny, nz = (int(n) + 2 * MARGIN_CELLS + 1 for n in np.ceil((high - low) / spacing))
     shape = (nx, ny, nz)
     values = masks.cut(_grid_points(origin, spacing, shape)).reshape(shape)
     return SignedDistanceGrid(values, origin, spacing)
 
 
-def _refined(masks: _Masks, coarse: SignedDistanceGrid) -> SignedDistanceGrid:
-    """The grid with FINER cells for one, sampled anew near the hull; elsewhere interpolated."""
-    size = [FINER * (n - 1) + 1 for n in coarse.values.shape]
-    spacing = coarse.spacing / FINER
-    values = np.asarray(coarse.values, np.float32)
-    for axis, n in enumerate(size):
-        place = np.arange(n) / FINER
-        low = np.minimum(place.astype(int), values.shape[axis] - 2)
-        part = (place - low).astype(np.float32).reshape([-1 if k == axis else 1 for k in range(3)])
-        values = (1 - part) * values.take(low, axis) + part * values.take(low + 1, axis)
-    near = np.argwhere(np.abs(values) < np.sqrt(3) * coarse.spacing)
-    values[tuple(near.T)] = masks.cut(coarse.origin + spacing * near)
-    return SignedDistanceGrid(values, coarse.origin, spacing)
-
-
 def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
-    """The hull's signed distance on a grid of about `cells` along the longest side of the object.
+    """The hull's signed distance on a grid of `cells` along the longest side of the object.
 
     A coarse grid over `bounds` finds the hull's own box first. Raises CaptureError where no point is inside all masks.
     """
     low, high = bounds(capture)
     masks = _Masks(capture)
-    coarse = _sample(masks, low, high, min(cells, 32), MARGIN_CELLS)
+    coarse = _sample(masks, low, high, min(cells, 32))
     # A cell whose corner is nearer than its diagonal to the hull may hold a part of it.
     inside = np.argwhere(coarse.values < coarse.spacing * np.sqrt(3))
     if not (coarse.values < coarse.spacing).any() or len(inside) < MINIMUM_CELLS_ACROSS:
@@ -148,7 +130,7 @@ def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
         )
     low = np.maximum(low, coarse.origin + coarse.spacing * (inside.min(0) - 1))
     high = np.minimum(high, coarse.origin + coarse.spacing * (inside.max(0) + 1))
-    return _refined(masks, _sample(masks, low, high, -(-cells // FINER), -(-MARGIN_CELLS // FINER)))
+    return _sample(masks, low, high, cells)
 
 
 def visual_hull(grid: SignedDistanceGrid) -> Surface:
