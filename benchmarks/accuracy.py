@@ -52,6 +52,7 @@ COLUMNS = (
     ("F@0.5 mm", "f_score_0_5_mm", 1, 3),
     ("held-out PSNR dB", "held_out_views_psnr_db", 1, 1),
     ("s", "seconds", 1, 0),
+    ("runs", "repeats", 1, 0),
     ("peak MB", "peak_memory_mb", 1, 0),
 )
 
@@ -87,6 +88,7 @@ def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) 
         "case": name,
         **metrics["truth"],
         "seconds": statistics.median(seconds),
+        "repeats": repeats,
         "peak_memory_mb": max(peaks),
         "status": metrics["status"]["name"],
         "stages": seconds_of(stages),
@@ -127,7 +129,7 @@ def main() -> None:
     parser.add_argument("captures", type=Path)
     parser.add_argument("cases", nargs="*", help=" ".join(CASES))
     parser.add_argument("--preset", default="standard")
-    parser.add_argument("--repeats", type=int, default=1, help="runs of each case; the table has the median time")
+    parser.add_argument("--repeats", type=int, default=1, help="runs of each case; the table says how many, and has their median time")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         rows = [measure(name, given.captures, given.preset, Path(folder), given.repeats) for name in given.cases or CASES]
@@ -138,8 +140,8 @@ def main() -> None:
         rows = [found[name] for name in CASES if name in found]
     record = {"machine": machine(), "preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset} --repeats {given.repeats}"
-    text = f"`{command}` on {machine()}.\n\n{table(rows)}\n"
+    command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset}"
+    text = f"`{command}` on {machine()}; s is the median of the runs.\n\n{table(rows)}\n"
     stem.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 
