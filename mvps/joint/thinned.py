@@ -1,4 +1,4 @@
-"""Fewer lights of every view, for steps on the way.
+"""Fewer lights of every view: enough for vertices, which several views see, and for pixels on the way.
 
 Of a view's L lights every k-th stays, other ones in the next view: what one light does not show of a place, another view's light does. k is
 the largest number that leaves ENOUGH_LIGHTS of each view and ENOUGH_PHOTOGRAPHS in all.
