@@ -1,10 +1,11 @@
 """How much memory a reconstruction takes, and how many views at a time keep it below a limit.
 
-    peak = PROGRAM + PIXEL pixels + KEPT samples + VERTEX vertices + views at a time * IN_WORK * samples of the largest view
+    peak = program + HELD + PIXEL pixels + KEPT samples + VERTEX vertices + views at a time * IN_WORK * samples of the largest view
 
-pixels: of all masks; samples: pixels times lights; vertices: of the last mesh. Before there is one its area is known from the masks, four
-times the mean projection of a convex body (Cauchy 1832), and DENSITY says how many vertices a preset is likely to put on a pixel's area.
-Creases may ask for more, so every mesh is looked at again. Sizes are in bytes, measured as the largest resident set (docs/method.md).
+program: what it takes with its libraries, which their build decides (torch for the CPU 0.3 GB, for CUDA 0.6); pixels: of all masks;
+samples: pixels times lights; vertices: of the last mesh. Before there is one its area is known from the masks, four times the mean
+projection of a convex body (Cauchy 1832), and DENSITY says how many vertices a preset is likely to put on a pixel's area. Creases may ask
+for more, so every mesh is looked at again. Sizes are in bytes, measured as the largest resident set (docs/method.md).
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from collections.abc import Sequence
 from mvps.cores import at_a_time, work_on
 from mvps.scene import CaptureError
 
-PROGRAM = 500e6
-"""Libraries (0.4 GB as imported), and what the allocator keeps of work that is done."""
+HELD = 185e6
+"""What the allocator keeps of work that is done."""
 
 PIXEL = 400.0
 """Normal maps, Stage I's rays and grids, the hull's."""
@@ -32,13 +33,13 @@ IN_WORK = 25.0
 DENSITY = {"draft": 0.35, "standard": 1.25, "fine": 2.8}
 """Vertices over the area in pixels. In `standard` 0.8 to 1.2 on two captures, and 3.5 on one that is creased all over."""
 
-_limit: list[tuple[float, Sequence[tuple[int, int]]]] = []
+_limit: list[tuple[float, float, Sequence[tuple[int, int]]]] = []
 
 
-def peak_bytes(sizes: Sequence[tuple[int, int]], vertices: float, views: int) -> float:
+def peak_bytes(program: float, sizes: Sequence[tuple[int, int]], vertices: float, views: int) -> float:
     """The largest resident set to expect for views of `sizes` (pixels of the mask, lights), with so many `views` at a time."""
     pixels, samples = sum(of_mask for of_mask, _ in sizes), [of_mask * lights for of_mask, lights in sizes]
-    return PROGRAM + PIXEL * pixels + KEPT * sum(samples) + VERTEX * vertices + views * IN_WORK * max(samples)
+    return program + HELD + PIXEL * pixels + KEPT * sum(samples) + VERTEX * vertices + views * IN_WORK * max(samples)
 
 
 def likely_vertices(sizes: Sequence[tuple[int, int]], preset: str) -> float:
@@ -46,18 +47,19 @@ def likely_vertices(sizes: Sequence[tuple[int, int]], preset: str) -> float:
     return DENSITY[preset] * 4 * sum(pixels for pixels, _ in sizes) / len(sizes)
 
 
-def keep_below(gigabytes: float, sizes: Sequence[tuple[int, int]], preset: str) -> None:
-    """Keep this process below a limit, in 10^9 bytes. CaptureError where it cannot be, as far as the masks tell."""
-    _limit[:] = [(1e9 * gigabytes, sizes)]
+def keep_below(gigabytes: float, program: float, sizes: Sequence[tuple[int, int]], preset: str) -> None:
+    """Keep this process below a limit, in 10^9 bytes; program: bytes that it takes with all libraries imported. CaptureError where it
+    cannot be, as far as the masks tell."""
+    _limit[:] = [(1e9 * gigabytes, program, sizes)]
     room_for(likely_vertices(sizes, preset))
 
 
 def room_for(vertices: float) -> None:
     """Work on no more views at a time than the limit, where there is one, allows beside a mesh. CaptureError where one is too many."""
-    for limit, sizes in _limit:
-        fits = [views for views in range(1, at_a_time() + 1) if peak_bytes(sizes, vertices, views) <= limit]
+    for limit, program, sizes in _limit:
+        fits = [views for views in range(1, at_a_time() + 1) if peak_bytes(program, sizes, vertices, views) <= limit]
         if not fits:
-            least, most = peak_bytes(sizes, vertices, 1) / 1e9, max(lights for _, lights in sizes)
+            least, most = peak_bytes(program, sizes, vertices, 1) / 1e9, max(lights for _, lights in sizes)
             raise CaptureError(
                 f"--max-memory: wanted at least {least + 0.05:.1f} GB for {len(sizes)} views of up to {most} lights and a mesh of about"
                 f" {vertices:.0f} vertices, given {limit / 1e9:g}; use fewer --views or --lights, or a quicker --preset"

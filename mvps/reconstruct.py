@@ -16,7 +16,7 @@ from mvps import __version__
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
 from mvps.cores import on_cores
 from mvps.memory import keep_below
-from mvps.progress import Progress
+from mvps.progress import Progress, peak_memory_mb
 from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
 if TYPE_CHECKING:
@@ -379,7 +379,11 @@ def main(argv: Sequence[str]) -> None:
 
     def before_decoding(sizes: list[tuple[int, int]]) -> None:
         if given.max_memory is not None:
-            keep_below(given.max_memory, sizes, given.preset)
+            # What the program takes is known once its libraries are there.
+            import mvps.joint.refine
+            import mvps.texture  # noqa: F401
+
+            keep_below(given.max_memory, 1e6 * peak_memory_mb(), sizes, given.preset)
 
     progress = Progress()
     with progress.stage("load") as stage:
