@@ -157,12 +157,14 @@ def shaped(
 
     Normals carve the field's hollows, and in a better carved hollow normals and lights are better. A hull that is good enough stays.
     """
+    from mvps.joint.pixels import OWN_LIGHTS
     from mvps.joint.refine import POOR_FIT
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
 
     rounds, shift = list(rough.rounds), rough.rounds[0]["vertex_change_px"]
     words = f"views moved the hull by {shift:.2f} px"
-    if shift < GOOD_HULL:
+    # Of fewer lights a view's normals say nothing of their own, and nothing asks the hull to move.
+    if shift < GOOD_HULL and min(len(view.lights) for view in capture.views) >= OWN_LIGHTS:
         with progress.stage("occupancy field") as stage:
             stage.status(f"skipped: {words}, less than {GOOD_HULL} px")
         return rough.surface, rough, rounds

@@ -138,6 +138,19 @@ def test_a_hull_that_is_good_enough_goes_without_the_occupancy_field() -> None:
     assert np.abs(np.linalg.norm(found.surface.vertices, axis=1) - RADIUS).mean() < 0.1 * pixel
 
 
+def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their views would leave any hull where it is; Stage I runs all the same."""
+    rough = SimpleNamespace(
+        lights=None, maps=(), law=None, carried=None, surface="hull", rounds=[{"residual": 0.01, "vertex_change_px": 0.0}]
+    )
+    monkeypatch.setattr("mvps.reconstruct.stage_one", lambda *_: "field")
+    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: rough)
+    monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    for lights, surface in ((1, "field"), (3, "field"), (4, "hull")):
+        capture = SimpleNamespace(views=[SimpleNamespace(lights=tuple(range(lights)))])
+        assert shaped(capture, None, rough, Settings("somewhere"), True, Progress())[0] == surface  # type: ignore[arg-type]
+
+
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
     out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9")
     found = figures(out, capture)
