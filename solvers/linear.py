@@ -14,7 +14,7 @@ import scipy.sparse.linalg as spl
 from numpy.typing import NDArray
 
 TOLERANCE = 1e-5
-"""Of the residual in `nearby`, relative: on a mesh of 66 000 vertices the solution is then 1e-4 pixels off at most."""
+"""Of the residual in `nearby`, relative: on meshes of 47 000 and 89 000 vertices three fusions then end 2e-3 pixels off at most."""
 
 MOST_STEPS = 100
 """A factor of a nearby matrix needs a handful."""

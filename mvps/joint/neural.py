@@ -25,6 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvps.cores import on_cores
 from mvps.joint.blocks import WORKERS, Shaded, evaluate, robust
 from mvps.joint.lights import on_some
 from mvps.joint.observe import ViewSamples
@@ -37,6 +38,7 @@ from mvps.scene import Float, Law, Residual
 from solvers.adam import Adam
 
 NAME = "neural residual where the fit is poor"
+NOT_TRIED = "neural residual: not tried, too little fits badly"
 
 LEARN_VERTICES, JUDGE_VERTICES = 3000, 1000
 """Vertices that stand for all while the network is learnt, and others on which it is judged; in this proportion where there are fewer."""
@@ -102,8 +104,7 @@ def _sums(of: Observed, every: int, first: int) -> Tensor:
 
 def _summed(of: Observed, parts: int) -> list[Tensor]:
     """`_sums` of the views dealt into parts."""
-    with ThreadPoolExecutor(WORKERS) as pool:
-        return list(pool.map(lambda k: _sums(of, parts, k), range(parts)))
+    return on_cores(lambda k: _sums(of, parts, k), range(parts))
 
 
 def _population(sums: Tensor) -> _Population:
@@ -205,7 +206,7 @@ def neural_residual(of: Observed, relative: Tensor, poor: float, generator: np.r
     start = time.perf_counter()
     bad = torch.nonzero(relative > poor)[:, 0]
     if not float(relative.nanmedian()) > poor or len(bad) < LEAST_VERTICES:
-        return Trial(NAME, False, 0.0, 0.0, time.perf_counter() - start), None
+        return Trial(NOT_TRIED, False, 0.0, 0.0, time.perf_counter() - start), None
     seeded = torch.Generator().manual_seed(int(generator.integers(2**31)))
     order = torch.from_numpy(generator.permutation(len(bad))[: LEARN_VERTICES + JUDGE_VERTICES]).to(bad.device)
     judge, learn = (part.sort().values for part in order.tensor_split([len(order) * JUDGE_VERTICES // (LEARN_VERTICES + JUDGE_VERTICES)]))

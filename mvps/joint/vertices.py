@@ -42,7 +42,7 @@ MINIMUM_VIEWS = 1.5
 """Effective number of views, (sum w)^2 / sum w^2, from which their agreement says something."""
 
 SWEEPS = 2
-"""Reweightings of the agreed positions in a fusion. Five views, fusions of the last round: 2 of them 0.148 px, 3 0.145, 5 0.143."""
+"""Reweightings of the agreed positions in a fusion. Five views, three fusions in the last round: 2 of them 0.148 px, 3 0.145, 5 0.143."""
 
 FAR_OFF = 3.0
 """Standard deviations from which an agreed position counts as an outlier (Cauchy's scale)."""
