@@ -27,14 +27,6 @@ def project(camera: Camera, points: Float) -> tuple[Float, Float]:
     return image[..., :2] / image[..., 2:], depth
 
 
-def unproject(camera: Camera, image: Float, depth: Float) -> Float:
-    """World points (..., 3) at image coordinates (..., 2) and depth (...,)."""
-    homogeneous = np.concatenate([image, np.ones_like(image[..., :1])], -1)
-    local = homogeneous @ np.linalg.inv(camera.K).T * np.asarray(depth)[..., None]
-    points: Float = (local - camera.translation) @ camera.rotation
-    return points
-
-
 def rays(camera: Camera, image: Float) -> tuple[Float, Float]:
     """Origins (..., 3) (the camera's centre) and unit directions (..., 3) in the world, through image coordinates (..., 2)."""
     homogeneous = np.concatenate([image, np.ones_like(image[..., :1])], -1)

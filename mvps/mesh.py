@@ -79,19 +79,6 @@ def mean_edge_length(surface: Surface) -> float:
     return float(lengths(corners - corners[:, [1, 2, 0]]).mean())
 
 
-def is_closed(surface: Surface) -> bool:
-    """True where every edge has exactly two faces."""
-    halves = np.sort(surface.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    _, count = np.unique(halves[:, 0] * len(surface.vertices) + halves[:, 1], return_counts=True)
-    return bool((count == 2).all())
-
-
-def signed_volume(surface: Surface) -> float:
-    """Volume of a closed mesh, positive where the faces point outwards."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    return float((a * np.cross(b, c)).sum() / 6)
-
-
 def without_unused_vertices(surface: Surface) -> Surface:
     """The same faces over only the vertices that they use."""
     used, inverse = np.unique(surface.faces, return_inverse=True)

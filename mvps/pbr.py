@@ -61,9 +61,3 @@ def srgb_bytes(linear: Float) -> NDArray[np.uint8]:
     encoded = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055)
     coded: NDArray[np.uint8] = np.rint(encoded * 255).astype(np.uint8)
     return coded
-
-
-def linear_from_srgb(encoded: NDArray[np.uint8]) -> Float:
-    """Linear values in [0, 1] of 8-bit sRGB."""
-    x = np.asarray(encoded, np.float64) / 255
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from references import unproject
 
 from mvps.camera import (
     DILIGENT_FROM_CAMERA,
@@ -15,7 +16,6 @@ from mvps.camera import (
     pixel_footprint,
     project,
     rays,
-    unproject,
     view_directions,
 )
 from mvps.scene import Camera

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from references import linear_from_srgb
 from sphere_scene import SphereScene, make_sphere
 
 import mvps.export
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.folders import appearing_whole
-from mvps.pbr import linear_from_srgb, reflectance_scale
+from mvps.pbr import reflectance_scale
 from mvps.scene import CaptureError, Material, Reconstruction
 from mvps.texture import Textures, bake
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import trimesh
+from references import is_closed, signed_volume
 
 from mvps import mesh
 from mvps.scene import Surface
@@ -38,7 +39,7 @@ def test_degenerate_faces_do_not_spoil_normals() -> None:
 def test_remeshing_reaches_the_edge_length_and_stays_closed_on_the_surface() -> None:
     fine = mesh.isotropic_remesh(sphere(), 0.15)
     assert abs(mesh.mean_edge_length(fine) - 0.15) < 0.02
-    assert mesh.is_closed(fine) and mesh.signed_volume(fine) > 0
+    assert is_closed(fine) and signed_volume(fine) > 0
     assert np.abs(np.linalg.norm(fine.vertices, axis=1) - 2).max() < 0.02
 
 
@@ -46,12 +47,12 @@ def test_largest_component_is_kept_and_unused_vertices_go() -> None:
     big, small = sphere(3), sphere(1, 0.5)
     both = Surface(np.concatenate([small.vertices + 9, big.vertices]), np.concatenate([small.faces, big.faces + len(small.vertices)]))
     kept = mesh.largest_component(both)
-    assert len(kept.vertices) == len(big.vertices) and np.isclose(mesh.signed_volume(kept), mesh.signed_volume(big))
+    assert len(kept.vertices) == len(big.vertices) and np.isclose(signed_volume(kept), signed_volume(big))
 
 
 def test_turning_the_faces_turns_the_volume_negative() -> None:
     ball = sphere(2)
-    assert mesh.signed_volume(Surface(ball.vertices, ball.faces[:, ::-1])) < 0 < mesh.signed_volume(ball)
+    assert signed_volume(Surface(ball.vertices, ball.faces[:, ::-1])) < 0 < signed_volume(ball)
 
 
 def test_splitting_edges_keeps_a_mesh_closed_its_volume_and_its_orientation() -> None:
@@ -59,7 +60,7 @@ def test_splitting_edges_keeps_a_mesh_closed_its_volume_and_its_orientation() ->
     for share in (0.0, 0.3, 1.0):
         marked = np.random.default_rng(0).random(len(mesh.edges(ball))) < share
         split = mesh.split_edges(ball, marked)
-        assert mesh.is_closed(split) and len(split.vertices) == len(ball.vertices) + marked.sum()
-        assert np.isclose(mesh.signed_volume(split), mesh.signed_volume(ball)) and np.isclose(
+        assert is_closed(split) and len(split.vertices) == len(ball.vertices) + marked.sum()
+        assert np.isclose(signed_volume(split), signed_volume(ball)) and np.isclose(
             mesh.face_areas(split).sum(), mesh.face_areas(ball).sum()
         )

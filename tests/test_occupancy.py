@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from references import is_closed, signed_volume
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.field import covering, gradient
 from mvps.fieldrays import ring_pixels
 from mvps.hull import default_cells, signed_distance
-from mvps.mesh import is_closed, normalise, signed_volume
+from mvps.mesh import normalise
 from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings, composite, crossing
 from mvps.scene import Camera, Capture, NormalMap, Surface
 

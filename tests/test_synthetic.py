@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from references import is_closed, signed_volume
 
 from mvps.command import run
 from mvps.load import read_calibrated_lights, read_capture, read_truth
 from mvps.measures import angles_deg, mesh_normal_errors
-from mvps.mesh import is_closed, largest_component, signed_volume, vertex_normals
+from mvps.mesh import largest_component, vertex_normals
 from mvps.rendering import points_under
 from mvps.scene import Camera, CaptureError, Lights, Surface
 from mvps.synthetic.__main__ import main

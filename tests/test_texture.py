@@ -11,12 +11,13 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from references import linear_from_srgb
 from sphere_scene import RADIUS, SphereScene, colours, make_sphere
 
 from mvps.atlas import AXES, PADDING, STEEPEST, Atlas, build_atlas, padded, rasterise, vertex_tangents
 from mvps.gltf import glb_bytes
 from mvps.mesh import face_areas, face_normals, normalise, vertex_normals
-from mvps.pbr import linear_from_srgb, reflectance_scale, roughness, specular_energy, srgb_bytes
+from mvps.pbr import reflectance_scale, roughness, specular_energy, srgb_bytes
 from mvps.rendering import photograph
 from mvps.scene import Capture, Lights, Material, Surface, View
 from mvps.texture import Textures, _robust_albedo, bake, pixel_albedo, png_bytes

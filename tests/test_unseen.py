@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from references import is_closed, signed_volume
 from sphere_scene import RADIUS, make_sphere
 
 from mvps.joint.unseen import closed_over
-from mvps.mesh import is_closed, signed_volume
 from mvps.scene import Surface
 from mvps.silhouette import mask_distance
 
