@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from mvps.mesh import face_normals, mean_edge_length, vertex_normals
 from mvps.scene import Float, Int, Surface
-from mvps.visibility import RayCaster, cast_shadow
+from mvps.visibility import RayCaster, cast_shadow, ray_caster
 
 RAYS = 128
 """Rays of a patch: the mean over an occluded tenth of the hemisphere is then known to about 25 %, over the patches that a point
@@ -50,7 +50,7 @@ class Gather:
 def gather(surface: Surface, size: float) -> Gather:
     """Patches of about `size`, and S between them. A patch is the vertices in a cube whose normals lie in one octant, so that thin parts
     keep two sides."""
-    caster, normals = RayCaster(surface), vertex_normals(surface)
+    caster, normals = ray_caster(surface), vertex_normals(surface)
     cube = np.floor((surface.vertices - surface.vertices.min(0)) / size).astype(np.int64)
     key = np.column_stack([cube, normals > 0])
     _, vertex, patch = np.unique(key, axis=0, return_index=True, return_inverse=True)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from mvps.cores import on_cores
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
-from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
+from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
 
 MINIMUM_LIGHTS = 4
@@ -186,7 +186,7 @@ def _to_world(scaled: Float, camera: Camera, ratio: Float) -> tuple[Float, Float
 def uncalibrated_lights(capture: Capture, surface: Surface, seed: int) -> Calibration:
     """Directions and intensities of all lights from the images and a rough surface's normals (module docstring)."""
     generator = np.random.default_rng(seed)
-    caster, normal = RayCaster(surface), vertex_normals(surface)
+    caster, normal = ray_caster(surface), vertex_normals(surface)
     samples = [_sampled(view, caster, normal, generator) for view in capture.views]
     counts = {len(view.lights) for view in capture.views}
     if min(counts) < MINIMUM_LIGHTS:

@@ -7,8 +7,9 @@ what the photographs and the mesh need. No value depends on it: results come in 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
 Result = TypeVar("Result")
@@ -30,3 +31,16 @@ def on_cores(task: Callable[..., Result], *arguments: Iterable[Any]) -> list[Res
     """[task(first arguments), task(second ones) ...] on all cores: numpy, torch and Embree release the interpreter's lock."""
     with ThreadPoolExecutor(at_a_time()) as pool:
         return list(pool.map(task, *arguments))
+
+
+def one_by_one(task: Callable[[int], Result], total: int) -> Iterator[Result]:
+    """task(0), task(1) ... of `total` on all cores, in this order, for results too large to hold all: while one is used, the next are
+    being made, and no more than one waits."""
+    with ThreadPoolExecutor(at_a_time()) as pool:
+        waiting: deque[Future[Result]] = deque()
+        for number in range(total):
+            if len(waiting) > at_a_time():
+                yield waiting.popleft().result()
+            waiting.append(pool.submit(task, number))
+        while waiting:
+            yield waiting.popleft().result()

@@ -21,14 +21,16 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
+from mvps.cores import at_a_time, on_cores
 from mvps.folders import appearing_whole
-from mvps.gltf import glb_bytes
+from mvps.gltf import glb_bytes, metallic_roughness
 from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
@@ -59,9 +61,12 @@ def write_reconstruction(reconstruction: Reconstruction, folder: Path, textures:
         for name, content in files.items():
             (writing / name).write_bytes(content)
         (writing / "normals").mkdir()
-        for view, normals in zip(reconstruction.views, reconstruction.normal_maps, strict=True):
+
+        def write_normals(view: str, normals: Float) -> None:
             np.save(writing / "normals" / f"{view}.npy", np.asarray(normals, np.float32))
             (writing / "normals" / f"{view}.png").write_bytes(png_bytes(normal_picture(normals)))
+
+        on_cores(write_normals, reconstruction.views, reconstruction.normal_maps)
 
 
 def read_reconstruction(folder: Path) -> Reconstruction:
@@ -174,17 +179,21 @@ def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
 
 
 def _model_files(reconstruction: Reconstruction, textures: Textures) -> dict[str, bytes]:
-    surface = reconstruction.surface
-    images = {
-        "model_base_color.png": png_bytes(textures.base_color),
-        "model_normal.png": png_bytes(textures.normal_map),
-        "model_roughness.png": png_bytes(textures.roughness),
-        "model_specular.png": png_bytes(textures.specular_color),
-    }
-    atlas = textures.atlas
-    obj = obj_bytes(surface.vertices, textures.mesh_normal, atlas.uv, surface.faces, atlas.faces, "model")
-    return images | {
-        "model.glb": glb_bytes(surface.vertices, textures),
+    surface, atlas = reconstruction.surface, textures.atlas
+    pictures = [textures.base_color, textures.normal_map, textures.roughness, textures.specular_color, metallic_roughness(textures)]
+    with ThreadPoolExecutor(at_a_time()) as pool:
+        # Text is formatted under the interpreter's lock, pictures are compressed without it.
+        encoded = pool.map(png_bytes, pictures)
+        obj = obj_bytes(surface.vertices, textures.mesh_normal, atlas.uv, surface.faces, atlas.faces, "model")
+        base_color, normal, roughness, specular, of_glb = encoded
+    return {
+        "model_base_color.png": base_color,
+        "model_normal.png": normal,
+        "model_roughness.png": roughness,
+        "model_specular.png": specular,
+        "model.glb": glb_bytes(
+            surface.vertices, textures, {"base_color": base_color, "normal": normal, "metallic_roughness": of_glb, "specular": specular}
+        ),
         "model.obj": obj,
         "model.mtl": _mtl(textures),
     }

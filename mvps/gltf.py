@@ -12,14 +12,16 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mvps.atlas import vertex_tangents
 from mvps.mesh import normalise
 from mvps.scene import Float
-from mvps.texture import Textures, png_bytes
+from mvps.texture import Textures
 
 DIELECTRIC = 0.04
 """F0 of glTF's default index of refraction 1.5."""
@@ -27,8 +29,17 @@ _FLOAT, _UNSIGNED, _VERTEX_DATA, _INDEX_DATA = 5126, 5125, 34962, 34963
 _LINEAR_MIPMAP, _LINEAR, _CLAMP = 9987, 9729, 33071
 
 
-def glb_bytes(vertices: Float, textures: Textures) -> bytes:
-    """The surface's vertices (V, 3) with their textures as a GLB file."""
+def metallic_roughness(textures: Textures) -> NDArray[np.uint8]:
+    """The picture (height, width, 3) that holds the roughness as glTF wants it, in the green channel."""
+    zero = np.zeros_like(textures.roughness)
+    return np.stack([zero, textures.roughness, zero], -1)
+
+
+def glb_bytes(vertices: Float, textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
+    """The surface's vertices (V, 3) with their textures as a GLB file.
+
+    pictures: base_color, normal, metallic_roughness and specular as PNG files, in this order.
+    """
     atlas = textures.atlas
     normal = normalise(textures.mesh_normal)
     tangent = vertex_tangents(atlas, normal)
@@ -41,14 +52,7 @@ def glb_bytes(vertices: Float, textures: Textures) -> bytes:
     binary = _Binary()
     attributes = {name: binary.accessor(values.astype("<f4"), _VERTEX_DATA, bounds=name == "POSITION") for name, values in arrays.items()}
     indices = binary.accessor(atlas.faces.astype("<u4").reshape(-1, 1), _INDEX_DATA)
-    zero = np.zeros_like(textures.roughness)
-    pictures = {
-        "base_color": textures.base_color,
-        "normal": textures.normal_map,
-        "metallic_roughness": np.stack([zero, textures.roughness, zero], -1),
-        "specular": textures.specular_color,
-    }
-    images = [{"name": name, "mimeType": "image/png", "bufferView": binary.view(png_bytes(picture))} for name, picture in pictures.items()]
+    images = [{"name": name, "mimeType": "image/png", "bufferView": binary.view(picture)} for name, picture in pictures.items()]
     document = {
         "asset": {"version": "2.0", "generator": "mvps"},
         "scene": 0,

@@ -26,7 +26,7 @@ import numpy as np
 from mvps.camera import pixel_footprint
 from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.scene import RELIABLE, Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
-from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
+from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 
 CONFIDENCE_GROUPS = 10
 
@@ -45,7 +45,7 @@ Light = tuple[Float, Float]
 
 def first_hit_points(surface: Surface, capture: Capture) -> Float:
     """(n, 3) world points where the rays through the mask's pixels of all views first meet the surface."""
-    caster = RayCaster(surface)
+    caster = ray_caster(surface)
     points = []
     for view in capture.views:
         hits = camera_hits(caster, view.camera, view.pixels)
@@ -144,7 +144,7 @@ def normal_errors(
 
 def mesh_normal_errors(surface: Surface, truth: Mapping[str, Float], capture: Capture, held_out: Collection[str] = ()) -> dict[str, float]:
     """`normal_errors` of the mesh's own normals at the first hits of the mask's pixels."""
-    caster = RayCaster(surface)
+    caster = ray_caster(surface)
     estimated = {view.name: mesh_normals(caster, view) for view in capture.views if view.name in truth}
     return normal_errors(estimated, truth, capture, held_out)
 
@@ -154,7 +154,7 @@ def confidence_errors(surface: Surface, material: Material, truth: Mapping[str, 
 
     truth: view name -> (height, width, 3) true normals, NaN where unknown. No common pixel gives no figures.
     """
-    caster = RayCaster(surface)
+    caster = ray_caster(surface)
     stated, measured = [], []
     for view in capture.views:
         if view.name not in truth:
@@ -226,7 +226,7 @@ def photograph_errors(
     """
     from mvps.rendering import light_arriving, light_sources, photograph
 
-    caster, sources = RayCaster(surface), light_sources(surface, material)
+    caster, sources = ray_caster(surface), light_sources(surface, material)
     pairs: list[tuple[View, Any, Any, Any]] = []
     for view in capture.views:
         kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]

@@ -248,9 +248,9 @@ def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[
     from scipy.ndimage import distance_transform_edt
 
     from mvps.rendering import points_under
-    from mvps.visibility import RayCaster
+    from mvps.visibility import ray_caster
 
-    caster = RayCaster(refined.surface)
+    caster = ray_caster(refined.surface)
     own = {view.name: maps for view, maps in zip(used.views, refined.maps, strict=True)}
     pictures = []
     for view in capture.views:

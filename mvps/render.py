@@ -68,7 +68,7 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
     from mvps.rendering import light_sources
     from mvps.scene import CaptureError
     from mvps.texture import png_bytes
-    from mvps.visibility import RayCaster
+    from mvps.visibility import ray_caster
 
     reconstruction = read_reconstruction(result)
     # Only the cameras are needed; one photograph of each view is the least that a capture can be read with.
@@ -78,7 +78,7 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
         raise CaptureError(
             f"{capture}: wanted the capture of the result's {', '.join(reconstruction.views)}, given one without these views"
         )
-    caster, sources = RayCaster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
+    caster, sources = ray_caster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
     with appearing_whole(out) as writing, Progress().stage("render", total=len(chosen)) as stage:
         for view in chosen:
             image, mask = render_view(caster, reconstruction, view.name, view.camera, sources)

@@ -9,6 +9,7 @@ The shading normal is the material's refined normal; shadows are traced on the m
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -70,8 +71,10 @@ class Arriving(NamedTuple):
         return at(self.sources, self.G, points, normal)
 
 
+@lru_cache(maxsize=1)
 def light_sources(surface: Surface, material: Material) -> Sources | None:
-    """What sends light to other parts of the surface; None where the material has no inter-reflection."""
+    """What sends light to other parts of the surface; None where the material has no inter-reflection. The last are kept: textures and
+    report ask for the same."""
     return coarse_sources(surface, material.albedo) if material.bounce else None
 
 

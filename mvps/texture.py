@@ -17,7 +17,6 @@ x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,12 +26,12 @@ from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
-from mvps.cores import at_a_time, on_cores
+from mvps.cores import one_by_one
 from mvps.mesh import face_areas, lengths, normalise, vertex_normals
 from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, Surface, View
-from mvps.visibility import RayCaster
+from mvps.visibility import RayCaster, ray_caster
 
 LARGEST_SIDE = 4096
 """Textures larger than this, texels, do not load on every graphics card."""
@@ -182,7 +181,7 @@ def _photographed_albedo(
     surface: Surface, material: Material, lights: Lights, capture: Capture, position: Float, normal: Float
 ) -> tuple[Float, Bool]:
     """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
-    caster, sources = RayCaster(surface), light_sources(surface, material)
+    caster, sources = ray_caster(surface), light_sources(surface, material)
     total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
 
     def solved(i: int) -> list[tuple[Int, Float, Float]]:
@@ -197,19 +196,13 @@ def _photographed_albedo(
             parts.append((start + seen, sampled, weight))
         return parts
 
-    for parts in _on_all_cores(solved, len(capture.views)):
+    for parts in one_by_one(solved, len(capture.views)):
         for seen, sampled, weight in parts:
             total[seen] += weight[:, None] * sampled
             weights[seen] += weight
     known = weights > 0
     total[known] /= weights[known, None]
     return total, known
-
-
-def _on_all_cores(task: Callable[[int], Any], total: int) -> Iterator[Any]:
-    """task(0), task(1) ... in this order, no more of them at a time than there are cores: numpy, torch and Embree release the lock."""
-    for start in range(0, total, at_a_time()):
-        yield from on_cores(task, range(start, min(start + at_a_time(), total)))
 
 
 def _away_from_border(view: View) -> Bool:

@@ -6,7 +6,7 @@ surface only up to its own resolution, so nearer occluders are an artefact of th
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,6 +77,12 @@ class RayCaster:
             len(origins),
         )
         return np.concatenate(chunks) if chunks else np.zeros(0, bool)
+
+
+@lru_cache(maxsize=1)
+def ray_caster(surface: Surface) -> RayCaster:
+    """The caster of a surface; the one asked for last is kept, because one stage after the other asks for the same."""
+    return RayCaster(surface)
 
 
 def _in_chunks(query: Any, rays_total: int) -> list[Any]:

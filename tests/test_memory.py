@@ -12,7 +12,7 @@ import pytest
 
 from mvps import cores, memory, reconstruct
 from mvps.command import run
-from mvps.cores import at_a_time, on_cores, work_on
+from mvps.cores import at_a_time, on_cores, one_by_one, work_on
 from mvps.load import read_capture
 from mvps.memory import keep_below, likely_vertices, peak_bytes, room_for
 from mvps.scene import CaptureError
@@ -73,6 +73,7 @@ def test_results_come_in_order_whatever_the_number_at_a_time() -> None:
     for most in (1, 3):
         work_on(most)
         assert on_cores(lambda a, b: a - b, range(9), range(0, 18, 2)) == [-k for k in range(9)]
+        assert list(one_by_one(lambda k: 2 * k, 9)) == list(range(0, 18, 2))
 
 
 def test_a_refused_limit_ends_before_photographs_are_decoded(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

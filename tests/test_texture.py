@@ -15,7 +15,7 @@ from references import linear_from_srgb
 from sphere_scene import RADIUS, SphereScene, colours, make_sphere
 
 from mvps.atlas import AXES, PADDING, STEEPEST, Atlas, build_atlas, padded, rasterise, vertex_tangents
-from mvps.gltf import glb_bytes
+from mvps.gltf import glb_bytes, metallic_roughness
 from mvps.mesh import face_areas, face_normals, normalise, vertex_normals
 from mvps.pbr import reflectance_scale, roughness, specular_energy, srgb_bytes
 from mvps.rendering import photograph
@@ -307,6 +307,16 @@ def test_a_hidden_part_takes_no_colour_from_what_hides_it() -> None:
     assert np.median(np.abs(colour[beside] - 0.6)) < 0.02 and np.median(np.abs(colour[front] - 0.3)) < 0.02
 
 
+def glb_of(surface: Surface, textures: Textures) -> bytes:
+    pictures = {
+        "base_color": textures.base_color,
+        "normal": textures.normal_map,
+        "metallic_roughness": metallic_roughness(textures),
+        "specular": textures.specular_color,
+    }
+    return glb_bytes(surface.vertices, textures, {name: png_bytes(picture) for name, picture in pictures.items()})
+
+
 def glb_parts(data: bytes) -> tuple[dict[str, object], dict[str, np.ndarray]]:
     """The JSON and the arrays of a GLB file, read by its specification."""
     magic, version, length = struct.unpack_from("<4sII", data)
@@ -329,7 +339,7 @@ def glb_parts(data: bytes) -> tuple[dict[str, object], dict[str, np.ndarray]]:
 def test_normal_map_decodes_to_the_refined_normals(scene: SphereScene, baked: Textures) -> None:
     """As a viewer does it, from the GLB alone: interpolate NORMAL and TANGENT, bitangent = cross(n, t) w, decode 2 c / 255 - 1."""
     surface = scene.reconstruction.surface
-    _, arrays = glb_parts(glb_bytes(surface.vertices, baked))
+    _, arrays = glb_parts(glb_of(surface, baked))
     faces = arrays["indices"].reshape(-1, 3).astype(int)
     t = rasterise(arrays["TEXCOORD_0"].astype(float), faces, baked.atlas.height, baked.atlas.width)
     n, tangent = (normalise((arrays[k][faces[t.face], :3].astype(float) * t.barycentric[..., None]).sum(1)) for k in ("NORMAL", "TANGENT"))
@@ -351,7 +361,7 @@ def test_roughness_and_specular_textures(scene: SphereScene, baked: Textures) ->
     f0 = linear_from_srgb(baked.specular_color[row, column]) * baked.specular_level
     expected_f0 = specular_energy(material.specular_weight[:1], material.sharpness) / baked.scale
     assert np.abs(f0 / expected_f0 - 1).max() < 0.01
-    document, _ = glb_parts(glb_bytes(scene.reconstruction.surface.vertices, baked))
+    document, _ = glb_parts(glb_of(scene.reconstruction.surface, baked))
     extension = document["materials"][0]["extensions"]["KHR_materials_specular"]  # type: ignore[index]
     assert extension["specularColorFactor"][0] * 0.04 == pytest.approx(baked.specular_level)
 
@@ -361,7 +371,7 @@ def test_a_matt_surface_says_so(scene: SphereScene) -> None:
     n = len(r.material.albedo)
     matt = replace(r.material, specular_weight=np.zeros((n, 0)), sharpness=np.zeros(0))
     textures = bake(r.surface, matt, r.lights, scene.capture, 2)
-    document, _ = glb_parts(glb_bytes(r.surface.vertices, textures))
+    document, _ = glb_parts(glb_of(r.surface, textures))
     material = document["materials"][0]  # type: ignore[index]
     assert material["extensions"]["KHR_materials_specular"] == {"specularFactor": 0.0}
     assert material["extras"]["albedo_scale"] == textures.scale

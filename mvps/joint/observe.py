@@ -27,7 +27,7 @@ from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
-from mvps.visibility import RayCaster, cast_shadow, visible_vertices
+from mvps.visibility import RayCaster, cast_shadow, ray_caster, visible_vertices
 
 SAMPLES_PER_CHUNK = 1 << 17
 """Samples handled at once: smaller chunks wait for the interpreter, larger ones leave the processor's last cache (docs/method.md)."""
@@ -120,13 +120,13 @@ def _pairs(view: View, caster: RayCaster, among: Bool | None = None) -> tuple[In
 
 def visible_in(capture: Capture, surface: Surface) -> list[tuple[Int, Float]]:
     """Per view the vertices that it sees (n,) and the weight of each pair (n,)."""
-    caster = RayCaster(surface)
+    caster = ray_caster(surface)
     return [_pairs(view, caster)[:2] for view in capture.views]
 
 
 def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None) -> list[ViewSamples]:
     """The samples of all views on the vertices of `surface`, or on those `among` (V,); visibility and cast shadows are traced anew."""
-    caster = RayCaster(surface)
+    caster = ray_caster(surface)
 
     def one(i: int) -> ViewSamples:
         view = capture.views[i]

@@ -23,7 +23,7 @@ from mvps.joint.thinned import kept
 from mvps.mesh import normalise
 from mvps.rendering import points_under, shadow_at
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
-from mvps.visibility import RayCaster
+from mvps.visibility import RayCaster, ray_caster
 
 NORMAL_TIE = 0.3
 """Standard deviation, radians, of a pixel's normal from the interpolated one: it only speaks where samples do not, for the agreement of
@@ -105,7 +105,7 @@ def all_pixel_normals(
     capture: Capture, surface: Surface, material: Material, lights: Lights, sources: Sources | None, every_other: bool = False
 ) -> tuple[NormalMap, ...]:
     """`pixel_normals` of every view, on all cores."""
-    caster, quick = RayCaster(surface), kept([len(view.lights) for view in capture.views])
+    caster, quick = ray_caster(surface), kept([len(view.lights) for view in capture.views])
 
     def one(i: int) -> NormalMap:
         of_view = capture.views[i], caster, sources, material, lights.direction[i], lights.intensity[i]

@@ -15,7 +15,7 @@ from mvps.rendering import light_sources
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
 from mvps.scene import Capture, Reconstruction, View
-from mvps.visibility import RayCaster
+from mvps.visibility import ray_caster
 
 VIEWS_SHOWN = 4
 
@@ -145,7 +145,7 @@ def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
     views = _known_views(reconstruction, capture)
     if not views:
         return ""
-    caster, sources = RayCaster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
+    caster, sources = ray_caster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
     parts = []
     shown = on_cores(lambda view: view_pictures(caster, sources, reconstruction, view), views)
     for view, (light, pictures) in zip(views, shown, strict=True):

@@ -11,7 +11,7 @@ from mvps.mesh import normalise
 from mvps.scene import Bool, Camera, Capture, Float, Lights, Material, Surface, Truth, View
 from mvps.synthetic.settings import SceneSettings
 from mvps.synthetic.shape import Shape, make_material, mesh_of
-from mvps.visibility import RayCaster, camera_hits, interpolate
+from mvps.visibility import camera_hits, interpolate, ray_caster
 
 SUPERSAMPLING = 2
 """Rays per pixel along each axis."""
@@ -97,7 +97,7 @@ def photograph_scene(scene: Scene) -> tuple[tuple[Bool, ...], tuple[NDArray[np.f
     """
     from mvps.rendering import photograph
 
-    caster = RayCaster(scene.surface)
+    caster = ray_caster(scene.surface)
     sub = np.stack(np.meshgrid(range(SUPERSAMPLING), range(SUPERSAMPLING), indexing="ij"), -1).reshape(-1, 2)
     masks, radiances, normal_maps = [], [], []
     for camera, direction, intensity in zip(scene.cameras, scene.lights.direction, scene.lights.intensity, strict=True):
