@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,8 +15,13 @@ from mvps.scene import Bool, Float, Int, Surface
 def face_cross(surface: Surface) -> Float:
     """(F, 3) cross product of two edges of every face: outward normal times twice the area."""
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    cross: Float = np.cross(b - a, c - a)
-    return cross
+    return cross(b - a, c - a)
+
+
+def cross(a: Float, b: Float) -> Float:
+    """Cross products (n, 3) of vectors a and b (n, 3); several times faster than numpy's."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
 def normalise(vectors: Float, floor: float = 1e-300) -> Float:
@@ -48,19 +54,32 @@ def face_areas(surface: Surface) -> Float:
     return areas
 
 
+_normals: WeakKeyDictionary[Surface, Float] = WeakKeyDictionary()
+
+
 def vertex_normals(surface: Surface) -> Float:
-    """(V, 3) unit outward normals: face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998)."""
-    corners = surface.vertices[surface.faces]
-    normals = face_normals(surface)
+    """(V, 3) unit outward normals: face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998). Read-only, made once
+    for a surface."""
+    known = _normals.get(surface)
+    if known is None:
+        known = _normals[surface] = _vertex_normals(surface)
+        known.flags.writeable = False
+    return known
+
+
+def _vertex_normals(surface: Surface) -> Float:
+    corners = [surface.vertices[surface.faces[:, k]] for k in range(3)]
+    sides = [corners[(k + 1) % 3] - corners[k] for k in range(3)]
+    outward = cross(sides[0], sides[1])
+    doubled = lengths(outward)
+    normals = normalise(outward)
     total = np.zeros_like(surface.vertices)
     for k in range(3):
-        u = normalise(corners[:, (k + 1) % 3] - corners[:, k])
-        v = normalise(corners[:, (k + 2) % 3] - corners[:, k])
-        angle = np.arccos(np.clip(np.einsum("fi,fi->f", u, v), -1, 1))
+        # Sides leave corner k along sides[k] and -sides[k - 1]; twice the area is the sine's part.
+        angle = np.arctan2(doubled, -np.einsum("fi,fi->f", sides[k], sides[k - 1]))
         for axis in range(3):
             total[:, axis] += np.bincount(surface.faces[:, k], angle * normals[:, axis], len(total))
-    flat = np.linalg.norm(total, axis=-1) < 1e-12
-    total[flat] = (0, 0, 1)
+    total[lengths(total) < 1e-12] = (0, 0, 1)
     return normalise(total)
 
 

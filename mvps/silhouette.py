@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from mvps.camera import footprint, project, rays, view_directions
+from mvps.camera import footprint, project, rays
 from mvps.mesh import lengths, normalise
 from mvps.scene import Bool, Camera, Float, Int
 from mvps.visibility import RayCaster
@@ -64,29 +64,30 @@ def mask_distance(mask: Bool) -> NDArray[np.float32]:
     return smooth
 
 
-def sampled(field: NDArray[np.float32], image: Float) -> NDArray[np.float32]:
-    """Bilinear values (n,) of a field (height, width) at image coordinates (n, 2); beyond the border its nearest value."""
+def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:
+    """Bilinear values (n[, channels]) of a field (height, width[, channels]) at image coordinates (n, 2), to a 32nd of a pixel; beyond the
+    border its nearest value, or 0 with cv2.BORDER_CONSTANT."""
     at = image.astype(np.float32) - np.float32(0.5)
-    values = np.empty(len(at), np.float32)
+    values = np.empty((len(at), *field.shape[2:]), np.float32)
     for start in range(0, len(at), REMAP_LIMIT):
         part = at[None, start : start + REMAP_LIMIT]
-        values[start : start + part.shape[1]] = cv2.remap(
-            field, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )[0]
+        values[start : start + part.shape[1]] = cv2.remap(field, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=border)[0]
     return values
 
 
 def outline(caster: RayCaster, camera: Camera) -> Outline:
     """The outline of the caster's mesh in a view."""
     x, normal, faces = caster.surface.vertices, caster.vertex_normals, caster.surface.faces
-    facing = np.einsum("ni,ni->n", normal, view_directions(camera, x))[faces]
+    # Not over the distance to the camera, which hardly differs between a face's corners: only the sign and ratios count.
+    facing = normal @ camera.centre - np.einsum("ni,ni->n", normal, x)
     turned = facing > 0
-    chosen = np.flatnonzero(turned.any(1) & ~turned.all(1))
+    sides = turned[faces].sum(1, dtype=np.int8)
+    chosen = np.flatnonzero((sides > 0) & (sides < 3))
+    of_corners, facing = turned[faces[chosen]], facing[faces[chosen]]
     # The corner on a side of its own comes first.
-    few = turned[chosen].sum(1) == 1
-    alone = np.where(few, turned[chosen].argmax(1), (~turned[chosen]).argmax(1))
+    alone = np.where(sides[chosen] == 1, of_corners.argmax(1), (~of_corners).argmax(1))
     order = (alone[:, None] + np.arange(3)) % 3
-    s = np.take_along_axis(facing[chosen], order, 1)
+    s = np.take_along_axis(facing, order, 1)
     corners = np.take_along_axis(faces[chosen], order, 1)
     part = s[:, :1] / (s[:, :1] - s[:, 1:])
     ends = x[corners[:, :1]] + part[..., None] * (x[corners[:, 1:]] - x[corners[:, :1]])

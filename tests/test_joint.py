@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import igl
 import numpy as np
 import pytest
 import torch
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
+from mvps.joint import vertices
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_derivatives, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, observe
@@ -18,8 +21,8 @@ from mvps.joint.photometry import grey_lights
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.steps import free_reflectance, stated_confidence, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
-from mvps.joint.vertices import Agreement, agreement, fuse, rotations
-from mvps.mesh import isotropic_remesh, normalise, vertex_normals
+from mvps.joint.vertices import Agreement, agreement, fuse
+from mvps.mesh import face_normals, isotropic_remesh, normalise, vertex_normals
 from mvps.scene import Capture, Law, Lights, Material, Surface
 
 CPU = torch.device("cpu")
@@ -192,8 +195,16 @@ def test_smallest_rotations_turn_source_to_target() -> None:
     rng = np.random.default_rng(1)
     source, target = (normalise(rng.normal(size=(100, 3))) for _ in range(2))
     target = np.where((source * target).sum(1, keepdims=True) < -0.9, -target, target)
-    R = rotations(source, target)
-    assert np.allclose(np.einsum("nij,nj->ni", R, source), target) and np.allclose(np.linalg.det(R), 1)
+    assert np.allclose(vertices.turned(source, target, source), target)
+    columns = [vertices.turned(source, target, np.tile(axis, (100, 1))) for axis in np.eye(3)]
+    assert np.allclose(np.linalg.det(np.stack(columns, -1)), 1)
+
+
+def test_divergence_of_unturned_faces_is_that_of_the_positions() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    surface = Surface(np.array(ball.vertices) * (1, 2, 3), np.array(ball.faces))
+    divergence = vertices._turned_divergence(surface, face_normals(surface))
+    assert np.allclose(divergence, -igl.cotmatrix(surface.vertices, surface.faces) @ surface.vertices)
 
 
 def test_views_agree_where_the_surface_is(scene: SphereScene) -> None:

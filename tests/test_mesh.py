@@ -1,5 +1,6 @@
 """Discrete geometry: laws of the operators."""
 
+import igl
 import numpy as np
 import trimesh
 from references import is_closed, signed_volume
@@ -28,6 +29,15 @@ def test_areas_of_a_sphere_sum_to_its_area() -> None:
 def test_vertex_normals_of_a_sphere_point_outwards() -> None:
     ball = sphere()
     assert ((mesh.vertex_normals(ball) * ball.vertices / 2).sum(1) > np.cos(np.radians(0.5))).all()
+
+
+def test_vertex_normals_are_made_once_for_a_surface_and_are_angle_weighted() -> None:
+    ball = sphere(2)
+    known = mesh.vertex_normals(ball)
+    assert mesh.vertex_normals(ball) is known and not known.flags.writeable
+    stretched = Surface(ball.vertices * (1, 2, 3), ball.faces)
+    angle = igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE
+    assert np.allclose(mesh.vertex_normals(stretched), igl.per_vertex_normals(stretched.vertices, stretched.faces, angle))
 
 
 def test_degenerate_faces_do_not_spoil_normals() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.mesh import face_normals, lengths, normalise
 from mvps.scene import Capture, Float, Int, NormalMap, Surface
+from mvps.silhouette import sampled
 
 LEAST_WEIGHT = 1e-3
 """Length of a weighted sum of normals below which it says nothing: one view at 88 degrees."""
@@ -42,12 +44,15 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
         visible = np.zeros(len(surface.vertices), bool)
         visible[seen[i]] = True
         chosen = np.flatnonzero(visible[faces].all(1))
-        positions, corners = bilinear(view.pixel_index, project(view.camera, centre[chosen])[0])
-        cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, centre[chosen])).clip(0)
-        w = corners * photometric.confidence[positions] * cosine[:, None] ** 2
-        return chosen, np.einsum("nkc,nk->nc", photometric.normal[positions], w)
+        image = np.zeros((*view.mask.shape, 3), np.float32)
+        image[view.mask] = photometric.normal * photometric.confidence[:, None]
+        points = centre[chosen]
+        cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, points)).clip(0)
+        return chosen, sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
 
     for chosen, summed in on_cores(of_view, range(len(capture.views))):
         total[chosen] += summed
-    known = lengths(total)[:, None] > LEAST_WEIGHT
-    return np.where(known, normalise(total), normalise(otherwise[faces].sum(1)))
+    unknown = lengths(total) <= LEAST_WEIGHT
+    target = normalise(total)
+    target[unknown] = normalise(otherwise[faces[unknown]].sum(1))
+    return target

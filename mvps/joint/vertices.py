@@ -29,13 +29,13 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mvps.camera import project, view_directions
+from mvps.camera import view_directions
 from mvps.cores import on_cores
 from mvps.joint.blocks import WORKERS
-from mvps.mesh import face_areas, face_normals, vertex_normals
-from mvps.scene import Capture, Float, Int, NormalMap, Surface, View
-from mvps.silhouette import outline, sampled
-from mvps.visibility import RayCaster
+from mvps.mesh import cross, face_areas, face_normals, vertex_normals
+from mvps.scene import Camera, Capture, Float, Int, NormalMap, Surface, View
+from mvps.silhouette import REMAP_LIMIT, outline, sampled
+from mvps.visibility import ray_caster
 from solvers.linear import CholeskyLike
 
 MINIMUM_VIEWS = 1.5
@@ -76,13 +76,12 @@ def feature_image(maps: NormalMap, mask: NDArray[np.bool_], index: Int) -> NDArr
     return image
 
 
-def _remap(image: NDArray[np.float32], at: Float) -> NDArray[np.float32]:
-    out = np.empty((len(at), image.shape[2]), np.float32)
-    at = at.astype(np.float32) - np.float32(0.5)
-    for start in range(0, len(at), 1 << 14):
-        part = at[None, start : start + (1 << 14)]
-        out[start : start + part.shape[1]] = cv2.remap(image, part[..., 0], part[..., 1], cv2.INTER_LINEAR)[0]
-    return out
+def _slid(camera: Camera, points: Float, direction: Float, offsets: Float) -> Float:
+    """(n * offsets, 2) image coordinates of points (n, 3) moved by offsets (offsets,) along their directions (n, 3)."""
+    start = (points @ camera.rotation.T + camera.translation) @ camera.K.T
+    along = direction @ (camera.K @ camera.rotation).T
+    moved = (start[:, None] + offsets[:, None] * along[:, None]).reshape(-1, 3)
+    return moved[:, :2] / moved[:, 2:]
 
 
 def _facing(view: View, points: Float, normal: Float) -> NDArray[np.float32]:
@@ -95,48 +94,45 @@ def _facing(view: View, points: Float, normal: Float) -> NDArray[np.float32]:
 def agreement(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Int], offsets: Float) -> Agreement:
     """Where along its normal each vertex agrees best between views. seen: per view the indices of vertices it sees;
     offsets (n,) evenly spaced, world units."""
-    normal = vertex_normals(surface)
-    weights_squared, weights_sum = np.zeros(len(normal)), np.zeros(len(normal))
+    normal, count = vertex_normals(surface), len(offsets)
+    step = max(1, REMAP_LIMIT // count)
 
-    def swept(hand: int) -> tuple[NDArray[np.float32], ...]:
-        """Sums over every WORKERS-th view."""
-        total = np.zeros((len(offsets), len(normal)), np.float32)
-        first, second = np.zeros((*total.shape, 3), np.float32), np.zeros_like(total)
+    def swept(hand: int) -> tuple[Float, NDArray[np.float32]]:
+        """Over every WORKERS-th view, sums of w and w^2 (V, 2) and, at every offset, of w b, w, w |b|^2 (V, offsets, 5)."""
+        weights, sums = np.zeros((len(normal), 2)), np.zeros((len(normal), count, 5), np.float32)
         for view, photometric, index in list(zip(capture.views, maps, seen, strict=True))[hand::WORKERS]:
             image = feature_image(photometric, view.mask, view.pixel_index)
-            local, points = normal[index], surface.vertices[index]
-            cosine = _facing(view, points, local)
-            for j, offset in enumerate(offsets):
-                value = _remap(image, project(view.camera, points + offset * local)[0])
-                confidence = value[:, 3]
-                feature = value[:, :3] / np.maximum(confidence, 1e-6)[:, None]
-                weight = cosine * confidence
-                total[j, index] += weight
-                first[j, index] += weight[:, None] * feature
-                second[j, index] += weight * np.einsum("ni,ni->n", feature, feature)
-        return total, first, second
+            for start in range(0, len(index), step):
+                part = index[start : start + step]
+                points, local = surface.vertices[part], normal[part]
+                cosine = _facing(view, points, local)
+                value = sampled(image, _slid(view.camera, points, local, offsets), cv2.BORDER_CONSTANT).reshape(-1, count, 4)
+                term = np.empty((len(part), count, 5), np.float32)
+                np.multiply(value, cosine[:, None, None], out=term[..., :4])
+                square = np.einsum("njc,njc->nj", term[..., :3], value[..., :3])
+                np.divide(square, np.maximum(value[..., 3], 1e-6), out=term[..., 4])
+                sums[part] += term
+                weights[part] += np.stack([cosine, cosine**2], 1)
+        return weights, sums
 
-    for view, index in zip(capture.views, seen, strict=True):
-        cosine = _facing(view, surface.vertices[index], normal[index])
-        weights_sum[index] += cosine
-        weights_squared[index] += cosine**2
-    total, first, second = (sum(parts) for parts in zip(*on_cores(swept, range(WORKERS)), strict=True))
-    mean = first / np.maximum(total, 1e-9)[..., None]
-    views = weights_sum**2 / np.maximum(weights_squared, 1e-12)
+    weights, sums = (sum(parts) for parts in zip(*on_cores(swept, range(WORKERS)), strict=True))
+    views = weights[:, 0] ** 2 / np.maximum(weights[:, 1], 1e-12)
     # The variance of n samples about their own mean is short of the true one by (n - 1) / n.
     unbias = views / np.maximum(views - 1, 0.5)
-    cost = np.maximum(second / np.maximum(total, 1e-9) - (mean**2).sum(-1), 0) * unbias
-    known = (total > 0.05 * weights_sum).all(0) & (views >= MINIMUM_VIEWS)
-    return _lowest(cost, known, offsets, views)
+    total = np.maximum(sums[..., 3], 1e-9)
+    cost = sums[..., 4] / total - np.square(sums[..., :3] / total[..., None]).sum(-1)
+    known = (sums[..., 3] > 0.05 * weights[:, :1]).all(1) & (views >= MINIMUM_VIEWS)
+    return _lowest(np.maximum(cost, 0) * unbias[:, None], known, offsets, views)
 
 
 def _lowest(cost: Float, known: NDArray[np.bool_], offsets: Float, views: Float) -> Agreement:
+    """Of cost (V, offsets), known (V,), views (V,)."""
     step = float(offsets[1] - offsets[0])
-    best = cost.argmin(0)
+    best = cost.argmin(1)
     inside = (best > 0) & (best < len(offsets) - 1) & known
     middle = np.clip(best, 1, len(offsets) - 2)
-    columns = np.arange(cost.shape[1])
-    low, mid, high = (cost[middle + k, columns].astype(np.float64) for k in (-1, 0, 1))
+    rows = np.arange(len(cost))
+    low, mid, high = (cost[rows, middle + k].astype(np.float64) for k in (-1, 0, 1))
     curvature = np.maximum(low - 2 * mid + high, 1e-30)
     shift = np.clip(0.5 * (low - high) / curvature, -1, 1)
     sigma = step * np.sqrt(2 * mid / (3 * np.maximum(views, 1) * curvature))
@@ -151,7 +147,7 @@ def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: 
 
     distance: per view the signed distance to its mask (height, width), pixels.
     """
-    caster = RayCaster(surface)
+    caster = ray_caster(surface)
     count = len(surface.vertices)
 
     def of_view(i: int) -> tuple[Float, Float]:
@@ -173,15 +169,25 @@ def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: 
     return Agreement((own * agreed.offset + pull) / safe, np.where(total > 0, 1 / np.sqrt(safe), np.inf))
 
 
-def rotations(source: Float, target: Float) -> Float:
-    """(n, 3, 3) smallest rotations that turn unit vectors source (n, 3) to target (n, 3) (Rodrigues)."""
-    axis = np.cross(source, target)
-    cosine = np.clip((source * target).sum(1), -0.99, 1)
-    K = np.zeros((len(source), 3, 3))
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 2] = -axis[:, 2], axis[:, 1], -axis[:, 0]
-    K[:, 1, 0], K[:, 2, 0], K[:, 2, 1] = axis[:, 2], -axis[:, 1], axis[:, 0]
-    rotated: Float = np.eye(3) + K + K @ K / (1 + cosine)[:, None, None]
-    return rotated
+def turned(source: Float, target: Float, vectors: Float) -> Float:
+    """Vectors (n, 3) turned by the smallest rotations that turn unit vectors source (n, 3) to target (n, 3) (Rodrigues)."""
+    axis = cross(source, target)
+    cosine = np.clip(np.einsum("ni,ni->n", source, target), -0.99, 1)
+    aside = cross(axis, vectors)
+    result: Float = vectors + aside + cross(axis, aside) / (1 + cosine)[:, None]
+    return result
+
+
+def _turned_divergence(surface: Surface, target: Float) -> Float:
+    """(V, 3) divergence of R_f grad x: a corner of face f takes R_f (n x opposite side) / 2, its hat function's gradient times the area."""
+    normal, corners = face_normals(surface), [surface.vertices[surface.faces[:, k]] for k in range(3)]
+    first, second = (turned(normal, target, cross(normal, corners[k - 1] - corners[k - 2]) / 2) for k in (0, 1))
+    divergence = np.zeros_like(surface.vertices)
+    # The three sides of a face add up to nothing.
+    for k, share in enumerate((first, second, -first - second)):
+        for axis in range(3):
+            divergence[:, axis] += np.bincount(surface.faces[:, k], share[:, axis], len(divergence))
+    return divergence
 
 
 def fuse(
@@ -192,18 +198,9 @@ def fuse(
     normal_sigma radians. The factor of the system may serve another fusion of a surface that has hardly moved.
     """
     x = surface.vertices
-    faces = np.ascontiguousarray(surface.faces)
-    R = rotations(face_normals(surface), target)
-    G = igl.grad(np.ascontiguousarray(x), faces)
-    F = len(faces)
-    gradient = (G @ x).reshape(3, F, 3)  # [axis of differentiation, face, coordinate]
-    # Turning a face turns both the directions of differentiation and the coordinates: grad of the identity map R_f applied to x.
-    turned = np.einsum("fab,dfb->dfa", R, gradient).reshape(3 * F, 3)
-    area = face_areas(surface)
-    scale = 1 / (normal_sigma**2 * area.sum() / len(x))
-    divergence = G.T @ sp.diags(np.tile(area, 3))
-    L = (divergence @ G * scale).tocsc()
-    right = divergence @ turned * scale
+    scale = len(x) / (normal_sigma**2 * face_areas(surface).sum())
+    L = igl.cotmatrix(x, surface.faces) * -scale
+    right = _turned_divergence(surface, target) * scale
     outward = vertex_normals(surface)
     agreed_at = x + agreed.offset[:, None] * outward
     sigma = agreed.sigma
