@@ -15,12 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from mvps import measures
+from mvps.device import chosen_device
 from mvps.joint.photometry import SHARPNESS
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.thinned import thinned
 from mvps.load import read_capture, read_truth
+from mvps.photometric import normal_maps
 from mvps.progress import Progress
-from mvps.reconstruct import Settings, first_lights, first_pass, photometric_stereo, rough_shape, shaped, stage_two
+from mvps.reconstruct import Settings, first_lights, first_pass, rough_shape, shaped, stage_two
 from mvps.scene import Capture, Law, Lights, NormalMap, Truth
 
 HERE = Path(__file__).resolve().parent
@@ -42,15 +44,16 @@ def errors(capture: Capture, truth: Truth, lights: Lights, maps: tuple[NormalMap
 def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     """One record of errors a round."""
     capture, truth, settings, progress = read_capture(path), read_truth(path), Settings(str(path)), Progress()
+    device = chosen_device(settings.device)
     grid, hull = rough_shape(capture, progress)
     lights = first_lights(capture, hull, None, settings.seed, progress)
-    maps = photometric_stereo(*thinned(capture, lights))
+    maps = normal_maps(*thinned(capture, lights), device)
     rough = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)
     surface, state, _ = shaped(capture, grid, rough, settings, True, progress)
     records = []
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))
     for k in range(rounds):
-        state = refine(capture, surface, state.lights, state.maps, state.law, one, k, "cpu", lambda *_: None)
+        state = refine(capture, surface, state.lights, state.maps, state.law, one, k, device, lambda *_: None)
         surface = state.surface
         records.append(errors(capture, truth, state.lights, state.maps))
     return records

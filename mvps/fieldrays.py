@@ -45,11 +45,11 @@ def _stride(pixels: Int) -> Int:
     return np.where((pixels % 4 == 0).all(1), 4, np.where((pixels % 2 == 0).all(1), 2, 1))
 
 
-def _joined(parts: list[tuple[NDArray[Any], ...]]) -> FieldRays:
-    return FieldRays(*(torch.tensor(np.concatenate(column), dtype=torch.float32) for column in zip(*parts, strict=True)))
+def _joined(parts: list[tuple[NDArray[Any], ...]], device: torch.device) -> FieldRays:
+    return FieldRays(*(torch.tensor(np.concatenate(column), dtype=torch.float32, device=device) for column in zip(*parts, strict=True)))
 
 
-def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre: Float, unit: float) -> FieldRays:
+def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre: Float, unit: float, device: torch.device) -> FieldRays:
     """Rays of the foreground pixels with a confidence over 0. Colour is albedo over the mean albedo, and the normal."""
     trusted = sum(float((maps.albedo.mean(1) * maps.confidence).sum()) for maps in normal_maps)
     total = sum(float(maps.confidence.sum()) for maps in normal_maps)
@@ -61,7 +61,7 @@ def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre
         anchor, direction = _anchored(view.camera, pixels, centre, unit)
         colour = np.concatenate([maps.albedo[known] / level, normal], 1)
         parts.append((anchor, direction, normal, colour, maps.confidence[known], np.ones(len(anchor)), _stride(pixels)))
-    return _joined(parts)
+    return _joined(parts, device)
 
 
 def ring_pixels(mask: Bool, ring: int) -> Int:
@@ -70,7 +70,7 @@ def ring_pixels(mask: Bool, ring: int) -> Int:
     return np.argwhere(inside + outside < ring + 0.5)
 
 
-def ring_rays(capture: Capture, centre: Float, unit: float, ring: int) -> FieldRays:
+def ring_rays(capture: Capture, centre: Float, unit: float, ring: int, device: torch.device) -> FieldRays:
     """Rays of the pixels around every silhouette."""
     parts: list[tuple[NDArray[Any], ...]] = []
     for view in capture.views:
@@ -79,7 +79,7 @@ def ring_rays(capture: Capture, centre: Float, unit: float, ring: int) -> FieldR
         nothing = np.zeros((len(pixels), 3))
         inside = view.mask[pixels[:, 0], pixels[:, 1]]
         parts.append((anchor, direction, nothing, nothing, np.ones(len(pixels)), inside, _stride(pixels)))
-    return _joined(parts)
+    return _joined(parts, device)
 
 
 @torch.no_grad()

@@ -46,7 +46,7 @@ COARSE_FACTOR = 4
 POINTS_PER_CALL = 1 << 16
 
 PARTS = 2
-"""Parts of a batch, a thread each: fixed, because the order of a sum is part of its value."""
+"""Parts of a batch on a CPU, a thread each: fixed, because the order of a sum is part of its value. A GPU takes the batch as a whole."""
 
 TRACED = 2.5
 """Cells, pixels, of the grid on which rays find the surface: the band of samples around what they find is wider than its error."""
@@ -161,10 +161,11 @@ class _Training:
     ) -> None:
         self.field, self.frame, self.data, self.ring, self.settings = field, frame, data, ring, settings
         self.generator = generator
-        self.pool_of_threads = ThreadPoolExecutor(PARTS)
-        self.seen = torch.zeros(len(data.anchor))
-        self.ring_seen = torch.zeros(len(ring.anchor))
-        self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long)
+        self.parts = PARTS if frame.low.device.type == "cpu" else 1
+        self.pool_of_threads = ThreadPoolExecutor(self.parts)
+        self.seen = torch.zeros_like(data.weight)
+        self.ring_seen = torch.zeros_like(ring.weight)
+        self.pool = self.ring_pool = torch.zeros(0, dtype=torch.long, device=frame.low.device)
         self.trained = trained
         # A tiny epsilon: a node's gradients are small only because few rays pass it.
         self.optimiser = Adam([*field.network(), *field.features], betas=(0.9, 0.99), epsilon=1e-12)
@@ -179,7 +180,7 @@ class _Training:
 
         def traced(rays: FieldRays, chosen: Tensor, through: bool) -> Tensor:
             parts = self.pool_of_threads.map(
-                lambda c: trace(frozen, rays.anchor[c], rays.direction[c], low, high, through), chosen.chunk(PARTS)
+                lambda c: trace(frozen, rays.anchor[c], rays.direction[c], low, high, through), chosen.chunk(self.parts)
             )
             return torch.cat(list(parts))
 
@@ -188,15 +189,16 @@ class _Training:
 
     def march(self, rays: FieldRays, draw: _Draw, around: Tensor, band: float, samples: int) -> tuple[Tensor, Tensor]:
         """Jittered distances (rays, samples) in a band around a distance, and the points (rays, samples, 3) there."""
-        distance = around[:, None] + band * ((torch.arange(samples) + draw.jitter) / samples * 2 - 1)
+        distance = around[:, None] + band * ((torch.arange(samples, device=around.device) + draw.jitter) / samples * 2 - 1)
         return distance, rays.anchor[draw.chosen][:, None] + distance[..., None] * rays.direction[draw.chosen][:, None]
 
     def _draw(self, pool: Tensor, count: int) -> list[_Draw]:
-        """Rays drawn from a pool, dealt into PARTS."""
-        chosen = pool[torch.randint(len(pool), (count,), generator=self.generator)]
-        jitter = torch.rand(count, 1, generator=self.generator)
-        aside = torch.randn(count // SMOOTHED, 3, generator=self.generator)
-        return [_Draw(*values) for values in zip(*(v.chunk(PARTS) for v in (chosen, jitter, aside)), strict=True)]
+        """Rays drawn from a pool, dealt into parts."""
+        generator, device = self.generator, pool.device
+        chosen = pool[torch.randint(len(pool), (count,), generator=generator, device=device)]
+        jitter = torch.rand(count, 1, generator=generator, device=device)
+        aside = torch.randn(count // SMOOTHED, 3, generator=generator, device=device)
+        return [_Draw(*values) for values in zip(*(v.chunk(self.parts) for v in (chosen, jitter, aside)), strict=True)]
 
     def mask_loss(self, draw: _Draw, distance: Tensor, value: Tensor, width: float) -> tuple[Tensor, Tensor]:
         """Cross-entropy of the opacity along rays of the ring, and the distance of their closest approach; of samples' distances and signed
@@ -228,13 +230,14 @@ class _Training:
         loss = s.normal * of_normal + s.colour * of_colour + s.smooth * of_smooth
         return loss, torch.where(opacity > 0.5, depth, nearest).detach()
 
-    def step(self, band: float, width: float, step: float, outlier: float, rate: float) -> float:
-        """One step of the optimiser, rates times `rate`; the loss. The parts of a batch are independent and run on a core each."""
+    def step(self, band: float, width: float, step: float, outlier: float, rate: float) -> Tensor:
+        """One step of the optimiser, rates times `rate`; the loss, not waited for. The parts of a batch are independent and run on a core
+        each."""
         s = self.settings
         draws, ring_draws = self._draw(self.pool, s.rays), self._draw(self.ring_pool, s.ring_rays)
         network, features = self.field.network(), self.field.in_use()
 
-        def part(k: int) -> tuple[float, tuple[Tensor, ...], Tensor, Tensor]:
+        def part(k: int) -> tuple[Tensor, tuple[Tensor, ...], Tensor, Tensor]:
             draw, ring_draw = draws[k], ring_draws[k]
             distance, points = self.march(self.data, draw, self.seen[draw.chosen], band, s.samples)
             ring_distance, ring_points = self.march(self.ring, ring_draw, self.ring_seen[ring_draw.chosen], band, s.ring_samples)
@@ -244,17 +247,17 @@ class _Training:
             colour = colour[: distance.numel()].view(*distance.shape, COLOURS)
             loss, seen = self.surface_loss(draw, distance, of_data.view(distance.shape), colour, width, step, outlier)
             of_mask, ring_seen = self.mask_loss(ring_draw, ring_distance, of_ring.view(ring_distance.shape), width)
-            total = (loss + s.mask * of_mask) / PARTS
-            return float(total.detach()), torch.autograd.grad(total, network + features), seen, ring_seen
+            total = (loss + s.mask * of_mask) / self.parts
+            return total.detach(), torch.autograd.grad(total, network + features), seen, ring_seen
 
-        parts = list(self.pool_of_threads.map(part, range(PARTS)))
+        parts = list(self.pool_of_threads.map(part, range(self.parts)))
         for draw, ring_draw, (_, _, seen, ring_seen) in zip(draws, ring_draws, parts, strict=True):
             self.seen[draw.chosen], self.ring_seen[ring_draw.chosen] = seen, ring_seen
         rates = [rate * s.network_rate] * len(network) + [rate * s.grid_rate] * len(features)
         self.optimiser.step(list(zip(*(gradients for _, gradients, _, _ in parts), strict=True)), rates, self.pool_of_threads)
-        return sum(loss for loss, *_ in parts)
+        return torch.stack([loss for loss, *_ in parts]).double().sum()
 
-    def run(self, on_step: Callable[[int, float], None]) -> None:
+    def run(self, on_step: Callable[[int, Tensor], None]) -> None:
         """All steps: ever more of the pixels; grids from coarse to fine; rates that rise shortly and fall to a 20th."""
         s = self.settings
         for k in range(s.steps):
@@ -268,19 +271,19 @@ class _Training:
             on_step(k, self.step(band, width, step, outlier, rate))
 
 
-def _frame(capture: Capture, grid: SignedDistanceGrid) -> _Frame:
+def _frame(capture: Capture, grid: SignedDistanceGrid, device: torch.device) -> _Frame:
     solid = np.argwhere(grid.values < 0)
     low, high = (grid.origin + grid.spacing * (corner + pad) for corner, pad in ((solid.min(0), -1), (solid.max(0), 1)))
     centre = (low + high) / 2
     unit = pixel_footprint([view.camera for view in capture.views], centre)
     # Two pixels of room: the surface may lie a little outside a hull whose masks are a little small.
-    local = [torch.tensor((corner - centre) / unit, dtype=torch.float32) for corner in (low, high)]
+    local = [torch.tensor((corner - centre) / unit, dtype=torch.float32, device=device) for corner in (low, high)]
     return _Frame(centre, unit, local[0] - 2, local[1] + 2)
 
 
 def _field(grid: SignedDistanceGrid, frame: _Frame, settings: OccupancySettings, seed: int) -> OccupancyField:
-    low = torch.tensor((grid.origin - frame.centre) / frame.unit, dtype=torch.float32)
-    base = torch.tensor(grid.values / frame.unit, dtype=torch.float32)
+    from_hull = (grid.origin - frame.centre) / frame.unit, grid.values / frame.unit
+    low, base = (torch.tensor(values, dtype=torch.float32, device=frame.low.device) for values in from_hull)
     grids = [covering(frame.low, frame.high, settings.finest * 2**level) for level in range(settings.levels)][::-1]
     base_grid = Grid(low, grid.spacing / frame.unit, base.shape)
     generator = torch.Generator().manual_seed(seed)
@@ -290,21 +293,23 @@ def _field(grid: SignedDistanceGrid, frame: _Frame, settings: OccupancySettings,
 class Occupancy:
     """The field of a capture, started at its visual hull. Normal maps train it: once, and again when better ones are known."""
 
-    def __init__(self, capture: Capture, hull_grid: SignedDistanceGrid, settings: OccupancySettings, seed: int) -> None:
-        self._capture, self._frame = capture, _frame(capture, hull_grid)
+    def __init__(
+        self, capture: Capture, hull_grid: SignedDistanceGrid, settings: OccupancySettings, seed: int, device: torch.device
+    ) -> None:
+        self._capture, self._frame = capture, _frame(capture, hull_grid, device)
         self._field = _field(hull_grid, self._frame, settings, seed)
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator(device).manual_seed(seed)
         self._trained = False
 
-    def trained(self, normal_maps: tuple[NormalMap, ...], settings: OccupancySettings, on_step: Callable[[int, float], None]) -> Surface:
+    def trained(self, normal_maps: tuple[NormalMap, ...], settings: OccupancySettings, on_step: Callable[[int, Tensor], None]) -> Surface:
         """The field's surface after training on the capture's masks and normal maps; world units.
 
-        on_step(step from 0, loss) is called after every step. The same seed and calls give the same surface.
+        on_step(step from 0, loss) is called after every step. The same seed and calls give the same surface, on a CPU.
         """
         torch.set_num_threads(1)
-        frame = self._frame
-        data = foreground_rays(self._capture, normal_maps, frame.centre, frame.unit)
-        ring = ring_rays(self._capture, frame.centre, frame.unit, settings.ring)
+        frame, device = self._frame, self._frame.low.device
+        data = foreground_rays(self._capture, normal_maps, frame.centre, frame.unit, device)
+        ring = ring_rays(self._capture, frame.centre, frame.unit, settings.ring, device)
         training = _Training(self._field, frame, data, ring, settings, self._generator, self._trained)
         with training.pool_of_threads:
             training.run(on_step)
@@ -320,8 +325,8 @@ def sampled(field: OccupancyField, low: Tensor, high: Tensor, voxel: float) -> T
         return torch.cat([field.signed_distance(part) for part in points.split(POINTS_PER_CALL)])
 
     cell = voxel * COARSE_FACTOR
-    size = [int(n) for n in ((high - low) / cell).ceil().long() + 1]
-    axes = [low[k] + cell * torch.arange(size[k]) for k in range(3)]
+    size = (((high - low) / cell).ceil().long() + 1).tolist()
+    axes = [low[k] + cell * torch.arange(size[k], device=low.device) for k in range(3)]
     coarse = values(torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).view(-1, 3)).view(*size)
     fine_size = [(n - 1) * COARSE_FACTOR + 1 for n in size]
     fine = torch.nn.functional.interpolate(coarse[None, None], size=fine_size, mode="trilinear", align_corners=True)[0, 0]
@@ -334,6 +339,6 @@ def extract(field: OccupancyField, low: Tensor, high: Tensor, voxel: float, cent
     """The field's zero level set on a grid of `voxel`, its largest component, faces outwards, world = centre + unit * local."""
     from skimage.measure import marching_cubes
 
-    vertices, faces, _, _ = marching_cubes(sampled(field, low, high, voxel).numpy(), 0.0)
-    local = low.numpy().astype(np.float64) + voxel * vertices.astype(np.float64)
+    vertices, faces, _, _ = marching_cubes(sampled(field, low, high, voxel).cpu().numpy(), 0.0)
+    local = low.cpu().numpy().astype(np.float64) + voxel * vertices.astype(np.float64)
     return largest_component(Surface(centre + unit * local, faces))

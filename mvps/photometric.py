@@ -7,72 +7,89 @@ left out, samples in attached shadow (n . l <= 0) too, since Lambert's law is no
 (cast shadow) or brighter (highlight) are outvoted. Albedo per channel is then the robust ratio of radiance to shading.
 
 Confidence (scene.py) is of the normal's standard deviation from the normal equations, residual scale included.
+
+float64: the least eigenvalue of the normal equations from which a pixel counts, 1e-6, is below float32's rounding of the largest, about a
+third of the number of lights.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
 
 from mvps.camera import pixel_centres, rays
-from mvps.scene import RELIABLE, Float, NormalMap, View
-from solvers.low_rank import robust_weights, solve_rows
+from mvps.cores import on_cores
+from mvps.scene import RELIABLE, Capture, Float, Lights, NormalMap, View
+from solvers.least_squares import cauchy_weights, weighted_rows
 
 SWEEPS = 4
 PIXELS_PER_CHUNK = 4096
 
 
-def grey(view: View, intensity: Float, part: slice) -> NDArray[np.float64]:
-    """(n, lights) mean over channels of radiance over intensity (lights, 3)."""
-    image: NDArray[np.float64] = (view.samples[part] * (view.scale / intensity)).mean(-1)
-    return image
+def normal_maps(capture: Capture, lights: Lights, device: torch.device) -> tuple[NormalMap, ...]:
+    """`normal_map` of every view on its own, on all cores."""
+    torch.set_num_threads(1)
+
+    def of_view(view: View, direction: Float, intensity: Float) -> NormalMap:
+        return normal_map(view, direction, intensity, device)
+
+    return tuple(on_cores(of_view, capture.views, lights.direction, lights.intensity))
 
 
-def normal_map(view: View, direction: Float, intensity: Float) -> NormalMap:
+def normal_map(view: View, direction: Float, intensity: Float, device: torch.device) -> NormalMap:
     """Normals (world frame), albedo and confidence of a view's foreground pixels under lights direction, intensity (lights, 3)."""
-    pixels = len(view.pixels)
-    normal, albedo, confidence = np.empty((pixels, 3)), np.empty((pixels, 3)), np.empty(pixels)
+
+    def tensor(values: Float) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=device)
+
     noise = float(view.scale / np.mean(intensity))
-    towards = -rays(view.camera, pixel_centres(view.pixels))[1]
-    usable = view.usable()
-    for start in range(0, pixels, PIXELS_PER_CHUNK):
-        part = slice(start, min(start + PIXELS_PER_CHUNK, pixels))
-        known = usable[part].astype(np.float64)
-        b, weight, sigma = _solve(grey(view, intensity, part), known, direction, noise)
-        length = np.linalg.norm(b, axis=1, keepdims=True)
-        solved = (length[:, 0] > noise) & np.isfinite(sigma)
-        unit = np.where(solved[:, None], b / np.maximum(length, 1e-300), towards[part])
-        # A visible point faces the camera: a normal past the horizon is turned back onto it.
-        beyond = np.minimum((unit * towards[part]).sum(1), 0)
-        unit = unit - beyond[:, None] * towards[part]
-        normal[part] = unit / np.linalg.norm(unit, axis=1, keepdims=True)
-        confidence[part] = np.where(solved, 1 / (1 + (sigma / RELIABLE) ** 2), 0)
-        albedo[part] = _albedo(view, part, np.maximum(normal[part] @ direction.T, 0), intensity, weight)
-    return NormalMap(normal.astype(np.float32), albedo.astype(np.float32), confidence.astype(np.float32))
+    light, per_channel = tensor(direction), tensor(view.scale / intensity)
+    towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels))[1]), view.usable()
+    columns: list[tuple[Tensor, ...]] = []
+    for start in range(0, len(view.pixels), PIXELS_PER_CHUNK):
+        part = slice(start, start + PIXELS_PER_CHUNK)
+        radiance = torch.from_numpy(view.samples[part].astype(np.float32)).to(device) * per_channel
+        known = torch.from_numpy(usable[part]).to(device).double()
+        columns.append(tuple(values.float() for values in pixels_solved(radiance, known, light, towards[part], noise)))
+    normal, albedo, confidence = (torch.cat(column).cpu().numpy() for column in zip(*columns, strict=True))
+    return NormalMap(normal, albedo, confidence)
 
 
-def _solve(image: Float, known: Float, direction: Float, noise: float) -> tuple[Float, Float, Float]:
+def pixels_solved(radiance: Tensor, known: Tensor, light: Tensor, towards: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Normals, albedo (n, 3) and confidence (n,) for radiance over intensity (n, lights, 3), where it is known (n, lights), the lights'
+    directions (lights, 3) and those to the camera (n, 3); float64. noise: of a sample over intensity."""
+    red, green, blue = radiance.unbind(-1)
+    b, weight, sigma = _solve((red + green + blue) / 3, known, light, noise)
+    length = b.norm(dim=1, keepdim=True)
+    solved = (length[:, 0] > noise) & sigma.isfinite()
+    unit = torch.where(solved[:, None], b / length.clamp_min(1e-300), towards)
+    # A visible point faces the camera: a normal past the horizon is turned back onto it.
+    beyond = (unit * towards).sum(1, keepdim=True).clamp_max(0)
+    normal = normalize(unit - beyond * towards, dim=1)
+    confidence = torch.where(solved, 1 / (1 + (sigma / RELIABLE) ** 2), 0.0)
+    return normal, _albedo(radiance, (normal @ light.T).clamp_min(0), weight), confidence
+
+
+def _solve(image: Tensor, known: Tensor, light: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
     """Robust b (n, 3), final weights (n, lights) and standard deviation of the normal (n,), infinite where three lights are missing."""
-    weight = known * (image > 0.1 * np.quantile(image, 0.8, axis=1, keepdims=True))
+    weight = known * (image > 0.1 * image.quantile(0.8, dim=1, keepdim=True))
     for _ in range(SWEEPS):
-        b = solve_rows(image, weight, direction, ridge=1e-6)
-        shading = b @ direction.T
-        lit = known * (shading > 0)
-        weight = robust_weights(image - shading, lit, noise)
-    total = weight.sum(1)
-    variance = (weight * (image - shading) ** 2).sum(1) / np.maximum(total - 3, 1)
-    pairs = (direction[:, :, None] * direction[:, None, :]).reshape(-1, 9)
-    gram = (weight @ pairs).reshape(-1, 3, 3)
-    smallest = np.linalg.eigvalsh(gram)[:, 0]
-    length = np.linalg.norm(b, axis=1)
+        b = weighted_rows(image, weight, light, ridge=1e-6)
+        shading = b @ light.T
+        weight = cauchy_weights(image - shading, known * (shading > 0), noise)
+    variance = (weight * (image - shading) ** 2).sum(1) / (weight.sum(1) - 3).clamp_min(1)
+    gram = (weight @ (light[:, :, None] * light[:, None, :]).view(-1, 9)).view(-1, 3, 3)
+    smallest = torch.linalg.eigvalsh(gram)[:, 0]
+    length = b.norm(dim=1)
     enough = ((weight > 0.1).sum(1) >= 3) & (smallest > 1e-6) & (length > 0)
-    sigma = np.sqrt((variance + noise**2) / np.where(enough, smallest, 1)) / np.where(enough, length, 1)
-    return b, weight, np.where(enough, sigma, np.inf)
+    sigma = ((variance + noise**2) / torch.where(enough, smallest, 1.0)).sqrt() / torch.where(enough, length, 1.0)
+    return b, weight, torch.where(enough, sigma, torch.inf)
 
 
-def _albedo(view: View, part: slice, shading: Float, intensity: Float, weight: Float) -> Float:
-    """(n, 3) least-squares albedo per channel for given shading (n, lights)."""
-    radiance = view.samples[part] * (view.scale / intensity)
-    denominator = np.maximum((weight * shading**2).sum(1), 1e-12)
-    albedo: Float = np.maximum(np.einsum("pl,plc->pc", weight * shading, radiance) / denominator[:, None], 0)
-    return albedo
+def _albedo(radiance: Tensor, shading: Tensor, weight: Tensor) -> Tensor:
+    """(n, 3) least-squares albedo per channel of radiance (n, lights, 3) for given shading (n, lights)."""
+    weighted = weight * shading
+    denominator = (weighted * shading).sum(1).clamp_min(1e-12)
+    return ((weighted[:, None] @ radiance)[:, 0] / denominator[:, None]).clamp_min(0)

@@ -19,7 +19,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, SupportsFloat
 
 logger = logging.getLogger("mvps")
 
@@ -58,7 +58,7 @@ class Stage:
     def __init__(self, name: str, total: int | None) -> None:
         self.name, self.total = name, total
         self.done = 0
-        self.values: dict[str, float] = {}
+        self.values: dict[str, SupportsFloat] = {}
         self.words = ""
         self._start = time.perf_counter()
         self._drawn = -SECONDS_BETWEEN_DRAWINGS
@@ -69,11 +69,13 @@ class Stage:
         """Time since the stage began."""
         return time.perf_counter() - self._start
 
-    def advance(self, steps: int = 1, **values: float) -> None:
-        """`steps` more of the total are done; values, such as a residual, replace the ones shown before."""
+    def advance(self, steps: int = 1, **values: SupportsFloat) -> None:
+        """`steps` more of the total are done; values, such as a residual, replace the ones shown before. They become floats when they are
+        shown: a GPU works on until then."""
         self.done += steps
-        self.values.update({name: float(value) for name, value in values.items()})
-        logger.debug("%s", self._text())
+        self.values.update(values)
+        if logger.isEnabledFor(logging.DEBUG):
+            logger.debug("%s", self._text())
         now = self.seconds
         if self._bar and now - self._drawn >= SECONDS_BETWEEN_DRAWINGS:
             self._drawn = now
@@ -90,7 +92,7 @@ class Stage:
         if self.words:
             record["status"] = self.words
         if self.values:
-            record["values"] = dict(self.values)
+            record["values"] = {name: float(value) for name, value in self.values.items()}
         return record
 
     def open(self) -> None:
@@ -105,7 +107,7 @@ class Stage:
         logger.info("%s: %s", self.name, ", ".join(words))
 
     def _values(self) -> list[str]:
-        return [f"{name.replace('_', ' ')} {value:.4g}" for name, value in self.values.items()]
+        return [f"{name.replace('_', ' ')} {float(value):.4g}" for name, value in self.values.items()]
 
     def _text(self) -> str:
         if self.total:

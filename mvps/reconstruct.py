@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from mvps import __version__
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
-from mvps.cores import on_cores
 from mvps.memory import keep_below
 from mvps.progress import Progress, peak_memory_mb
 from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
 if TYPE_CHECKING:
+    from mvps.device import Device
     from mvps.joint.refine import Refined, RefineSettings
     from mvps.occupancy import Occupancy, OccupancySettings
     from mvps.scene import SignedDistanceGrid, Surface
@@ -111,13 +111,6 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     return used, capture.select(rest) if rest else None
 
 
-def photometric_stereo(capture: Capture, lights: Lights) -> tuple[NormalMap, ...]:
-    """Photometric stereo of every view on its own, on all cores."""
-    from mvps.photometric import normal_map
-
-    return tuple(on_cores(normal_map, capture.views, lights.direction, lights.intensity))
-
-
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
     from mvps.hull import default_cells, signed_distance, visual_hull
@@ -157,6 +150,7 @@ def shaped(
 
     Normals carve the field's hollows, and in a better carved hollow normals and lights are better. A hull that is good enough stays.
     """
+    from mvps.device import chosen_device
     from mvps.joint.pixels import OWN_LIGHTS
     from mvps.joint.refine import POOR_FIT
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
@@ -169,7 +163,7 @@ def shaped(
             stage.status(f"skipped: {words}, less than {GOOD_HULL} px")
         return rough.surface, rough, rounds
     plan, refined, carried = OccupancySettings(), rough, None
-    field = Occupancy(capture, grid, plan, settings.seed)
+    field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device))
     surface = stage_one(field, rough.maps, plan, progress, words)
     for _ in range(MOST_TURNS):
         of_turn = between_passes(free_lights)
@@ -197,7 +191,8 @@ def stage_two(
     carried: tuple[Surface, Any] | None = None,
 ) -> Refined:
     """Rounds of Stage II under the progress bar."""
-    from mvps.joint.refine import chosen_device, refine
+    from mvps.device import chosen_device
+    from mvps.joint.refine import refine
 
     with progress.stage(name, total=len(plan.rounds)) as stage:
 
@@ -210,7 +205,7 @@ def stage_two(
     return refined
 
 
-def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: Refined) -> Lights:
+def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: Refined, device: Device) -> Lights:
     """Lights of every photograph of `capture`, in its order: refined where used, else carried over from the rig or fitted."""
     import numpy as np
 
@@ -230,7 +225,7 @@ def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: R
         rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
         if rest is not None:
             shared = refined.lights.one_rig and len({view.lights for view in rest.views}) == 1
-            fitted = fit_lights(rest, refined.surface, refined.material, shared)
+            fitted = fit_lights(rest, refined.surface, refined.material, shared, device)
             for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
                 known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
     direction = tuple(np.array([known[view.name, n][0] for n in view.lights]) for view in capture.views)
@@ -277,15 +272,18 @@ def versions() -> dict[str, str]:
 
 def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them."""
+    from mvps.device import chosen_device
     from mvps.joint.photometry import SHARPNESS
     from mvps.joint.refine import POOR_FIT
     from mvps.joint.thinned import thinned
+    from mvps.photometric import normal_maps
 
+    device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     grid, surface = rough_shape(used, progress)
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
-        maps = photometric_stereo(*thinned(used, start))
+        maps = normal_maps(*thinned(used, start), device)
     law, free = Law(SHARPNESS), lights is None
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":
@@ -299,7 +297,7 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
         start, maps, law = between.lights, between.maps, between.law
         refined = stage_two("joint refinement", used, surface, start, maps, law, plan, settings, progress, carried)
     with progress.stage("lights and normals of all views"):
-        complete = all_lights(capture, used, held, refined)
+        complete = all_lights(capture, used, held, refined, device)
         pictures = normal_pictures(capture, used, refined)
     metrics = {"stages": progress.stages, "rounds": rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
     metrics["model"] = {

@@ -2,9 +2,9 @@
 
     m <- b1 m + (1 - b1) g,   v <- b2 v + (1 - b2) g^2,   x <- x - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + eps)
 
-An entry whose gradients have all been zero does not move, so parameters that are not in use yet need no steps. Entries are handled in
-pieces that stay in the processor's cache, on the threads of a pool. (torch.optim steps whole tensors, and loads torch's compiler when first
-used: 2 s.)
+An entry whose gradients have all been zero does not move, so parameters that are not in use yet need no steps. On a CPU entries are
+handled in pieces that stay in the processor's cache, on the threads of a pool. (torch.optim steps whole tensors, and loads torch's compiler
+when first used: 2 s.)
 """
 
 from __future__ import annotations
@@ -47,5 +47,6 @@ class Adam:
         tasks = []
         for k in range(len(gradients)):
             count = self._values[k].numel()
-            tasks += [(k, slice(start, min(start + PIECE, count))) for start in range(0, count, PIECE)]
+            size = PIECE if self._values[k].device.type == "cpu" else max(1, count)
+            tasks += [(k, slice(start, min(start + size, count))) for start in range(0, count, size)]
         list(pool.map(piece, tasks))

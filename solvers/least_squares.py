@@ -1,4 +1,4 @@
-"""Batched small least-squares problems: Gauss-Newton steps with damping and lower bounds.
+"""Batched small least-squares problems on tensors: Gauss-Newton steps with damping and lower bounds, and robust rows.
 
 For each of n problems with normal equations H (p, p), g (p,):   minimise over d   1/2 d.H d + g.d   subject to d >= lower.
 
@@ -7,12 +7,17 @@ for unknowns that no sample speaks of, so that the step is finite and zero along
 
 The bounds are met by fixing the violated unknowns at their bound and solving again for the rest, at most p times (the fixing half of
 block principal pivoting, Portugal et al. 1994): every fixed unknown wanted to go below its bound.
+
+Robust rows: x_i that minimise sum_j w_ij rho((M_ij - x_i . y_j) / s_i) for known y_j, by reweighted least squares with the weights and
+scales of low_rank.py, which solves for both factors (in numpy).
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA
 
 FLOOR = 1e-7
 """Damping of an unknown relative to the largest diagonal entry of its problem: above float32's rounding, below any measurement."""
@@ -67,3 +72,24 @@ def _solved(H: Tensor, right: Tensor) -> Tensor:
     solution: Tensor = torch.linalg.solve_ex(scaled, matrix * scale[..., None])[0] * scale[..., None]
     solution = torch.where(torch.isfinite(solution), solution, torch.zeros_like(solution))
     return solution if right.ndim == 3 else solution[..., 0]
+
+
+def weighted_rows(M: Tensor, W: Tensor, Y: Tensor, ridge: float) -> Tensor:
+    """(m, r) rows x_i that minimise sum_j W_ij (M_ij - x_i . y_j)^2 for M, W (m, n), Y (n, r), damped by `ridge` of the mean diagonal."""
+    r = Y.shape[1]
+    A = (W @ (Y[:, :, None] * Y[:, None, :]).view(-1, r * r)).view(-1, r, r)
+    trace = A.diagonal(dim1=1, dim2=2).sum(1) / r
+    A = A + (ridge * trace + 1e-30)[:, None, None] * torch.eye(r, dtype=A.dtype, device=A.device)
+    solution: Tensor = torch.linalg.solve_ex(A, ((W * M) @ Y)[..., None])[0][..., 0]
+    return solution
+
+
+def cauchy_weights(residual: Tensor, known: Tensor, floor: float) -> Tensor:
+    """Cauchy's weights of residuals (m, n), 0 where not known (m, n), the scale of a row from its known entries and at least `floor`."""
+    # The median needs the lower half in order.
+    ordered = torch.where(known > 0, residual.abs(), torch.inf).topk(residual.shape[1] // 2 + 1, largest=False).values
+    count = (known > 0).sum(1, keepdim=True)
+    median = (ordered.gather(1, ((count - 1) // 2).clamp_min(0)) + ordered.gather(1, count // 2)) / 2
+    # A row without entries has no scale and needs none.
+    scale = (torch.where(count > 0, median, 1.0) * MAD_TO_SIGMA).clamp_min(max(floor, torch.finfo(residual.dtype).tiny))
+    return known / (1 + (residual / (CAUCHY_95 * scale)) ** 2)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
@@ -14,6 +15,8 @@ from mvps.mesh import normalise
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
 from mvps.silhouette import mask_distance
+
+CPU = torch.device("cpu")
 
 
 def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -153,7 +156,7 @@ def test_normals_in_one_plane_fix_no_ambiguity() -> None:
 def test_photometric_stereo_of_a_lambertian_sphere(scene: SphereScene) -> None:
     capture, lights, _ = lambertian(scene)
     view = capture.views[0]
-    maps = normal_map(view, lights.direction[0], lights.intensity[0])
+    maps = normal_map(view, lights.direction[0], lights.intensity[0], CPU)
     error = degrees(maps.normal, ball_normals(view))
     assert np.median(error) < 0.1 and np.quantile(error, 0.9) < 2
     expected = np.where(view.pixels[:, 1:] < view.camera.width / 2, 0.7, 0.4)
@@ -168,7 +171,7 @@ def test_shadows_highlights_and_saturation_are_outvoted(scene: SphereScene) -> N
     spoiled[:, 0] = 0  # one light blocked everywhere
     spoiled[:, 1] = np.minimum(spoiled[:, 1].astype(int) * 2 + 8000, 65534)  # one with a highlight everywhere
     spoiled[:, 2] = 65535  # one saturated
-    maps = normal_map(replace(view, samples=spoiled), lights.direction[0], lights.intensity[0])
+    maps = normal_map(replace(view, samples=spoiled), lights.direction[0], lights.intensity[0], CPU)
     assert np.median(degrees(maps.normal, ball_normals(view))) < 0.5
 
 
@@ -177,6 +180,6 @@ def test_a_dark_pixel_faces_the_camera_without_confidence(scene: SphereScene) ->
     view = capture.views[0]
     black = view.samples.copy()
     black[:5] = 0
-    maps = normal_map(replace(view, samples=black), lights.direction[0], lights.intensity[0])
+    maps = normal_map(replace(view, samples=black), lights.direction[0], lights.intensity[0], CPU)
     assert (maps.confidence[:5] == 0).all() and (degrees(maps.normal[:5], -view.camera.rotation[2]) < 15).all()
     assert np.isfinite(maps.albedo).all()

@@ -175,7 +175,7 @@ def test_light_step_is_finite_with_a_single_light(scene: SphereScene) -> None:
 
 def test_pixels_keep_the_normals_that_explain_them(scene: SphereScene) -> None:
     reconstruction = scene.reconstruction
-    maps = all_pixel_normals(scene.capture, reconstruction.surface, reconstruction.material, reconstruction.lights, None)
+    maps = all_pixel_normals(scene.capture, reconstruction.surface, reconstruction.material, reconstruction.lights, None, CPU)
     errors = [
         degrees(m.normal, truth[view.mask]) for m, truth, view in zip(maps, reconstruction.normal_maps, scene.capture.views, strict=True)
     ]
@@ -184,7 +184,7 @@ def test_pixels_keep_the_normals_that_explain_them(scene: SphereScene) -> None:
         vertex_normals(reconstruction.surface),
         *(getattr(reconstruction.material, k) for k in ("albedo", "specular_weight", "sharpness", "confidence")),
     )
-    again = all_pixel_normals(scene.capture, reconstruction.surface, smooth, reconstruction.lights, None)
+    again = all_pixel_normals(scene.capture, reconstruction.surface, smooth, reconstruction.lights, None, CPU)
     errors = [
         degrees(m.normal, truth[view.mask]) for m, truth, view in zip(again, reconstruction.normal_maps, scene.capture.views, strict=True)
     ]
@@ -209,7 +209,7 @@ def test_divergence_of_unturned_faces_is_that_of_the_positions() -> None:
 
 def test_views_agree_where_the_surface_is(scene: SphereScene) -> None:
     reconstruction = scene.reconstruction
-    maps = all_pixel_normals(scene.capture, reconstruction.surface, reconstruction.material, reconstruction.lights, None)
+    maps = all_pixel_normals(scene.capture, reconstruction.surface, reconstruction.material, reconstruction.lights, None, CPU)
     inside = isotropic_remesh(Surface(reconstruction.surface.vertices * 0.98, reconstruction.surface.faces), 1.0)
     from mvps.joint.observe import visible_in
 

@@ -18,6 +18,7 @@ from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings, composite, c
 from mvps.scene import Camera, Capture, NormalMap, Surface
 
 QUICK = OccupancySettings(steps=120, rays=512, ring_rays=256)
+CPU = torch.device("cpu")
 PIXEL = 2 * RADIUS / (0.8 * 96)
 
 
@@ -96,7 +97,7 @@ def exact_maps(capture: Capture, unit: float = 1.0) -> tuple[NormalMap, ...]:
 
 
 def run(capture: Capture, maps: tuple[NormalMap, ...], seed: int = 0) -> Surface:
-    return Occupancy(capture, signed_distance(capture, default_cells(capture)), QUICK, seed).trained(maps, QUICK, lambda _, __: None)
+    return Occupancy(capture, signed_distance(capture, default_cells(capture)), QUICK, seed, CPU).trained(maps, QUICK, lambda _, __: None)
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +145,7 @@ def test_a_field_trained_on_wrong_normals_recovers_when_trained_again(scene: Sph
     """Normals that all lean by 20 degrees put the surface off; better ones bring it back without starting from the hull."""
     exact = exact_maps(scene.capture)
     leaning = tuple(replace(maps, normal=normalise(maps.normal + np.float32([0, 0, 0.36]))) for maps in exact)
-    field = Occupancy(scene.capture, signed_distance(scene.capture, default_cells(scene.capture)), QUICK, 0)
+    field = Occupancy(scene.capture, signed_distance(scene.capture, default_cells(scene.capture)), QUICK, 0, CPU)
 
     def error(surface: Surface) -> float:
         return float(np.abs(np.linalg.norm(surface.vertices, axis=1) - RADIUS).mean() / PIXEL)

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 
 from solvers.adam import Adam
 from solvers.bounded import minimise
-from solvers.least_squares import bounded_step
+from solvers.least_squares import bounded_step, cauchy_weights, weighted_rows
 from solvers.linear import CholeskyLike
 from solvers.low_rank import factorise, robust_weights, solve_rows
 
@@ -50,6 +50,17 @@ def test_rows_without_entries_solve_to_zero() -> None:
 def test_weights_fall_with_the_residual_and_unknown_entries_weigh_nothing() -> None:
     weights = robust_weights(np.array([[0.0, 1.0, 2.0, 50.0, 1.0]]), np.array([[1.0, 1.0, 1.0, 1.0, 0.0]]), 0.1)[0]
     assert weights[0] == 1 and (np.diff(weights[:4]) < 0).all() and weights[3] < 0.02 and weights[4] == 0
+
+
+def test_rows_and_weights_on_tensors_are_those_of_the_factorisation() -> None:
+    rng = np.random.default_rng(8)
+    M, Y = low_rank(9, 50, 12) + rng.normal(0, 0.1, (50, 12)), rng.normal(size=(12, 3))
+    known = (rng.random(M.shape) < 0.7).astype(float)
+    known[0], known[1], known[2] = 0, 1, np.arange(12) == 5
+    weights = robust_weights(M, known, 1e-3)
+    on_tensors = [torch.tensor(a) for a in (M, known, weights, Y)]
+    assert np.allclose(cauchy_weights(*on_tensors[:2], 1e-3), weights, rtol=1e-12, atol=0)
+    assert np.allclose(weighted_rows(on_tensors[0], *on_tensors[2:], 1e-6), solve_rows(M, weights, Y, 1e-6), rtol=1e-9)
 
 
 def test_sparse_factor_solves_like_a_dense_one() -> None:

@@ -23,10 +23,10 @@ def carried_over(lights: Lights, rotations: list[Float], rotation: Float) -> tup
     return np.asarray(lights.direction[0]) @ rotations[0].T @ rotation, np.asarray(lights.intensity[0])
 
 
-def _vertices(material: Material) -> Vertices:
+def _vertices(material: Material, device: torch.device) -> Vertices:
     weight = material.specular_weight.mean(2) if material.specular_weight.ndim == 3 else material.specular_weight
     reflectance = np.column_stack([material.albedo.mean(1), weight])
-    normal, values = (torch.tensor(a, dtype=torch.float32) for a in (material.normal, reflectance))
+    normal, values = (torch.tensor(a, dtype=torch.float32, device=device) for a in (material.normal, reflectance))
     # Residuals of about a tenth of the albedo are outliers until the lights are known.
     return Vertices(normal, values, 0.1 * values[:, 0].clamp_min(1e-6))
 
@@ -40,7 +40,7 @@ def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[to
         sums.append((torch.einsum("pl,pi,pj->lij", weight, n, n), torch.einsum("pl,pl,pi->li", weight, samples.image, n)))
     if one_rig:
         sums = [(torch.stack([H for H, _ in sums]).sum(0), torch.stack([g for _, g in sums]).sum(0))] * len(sums)
-    eye = torch.eye(3)
+    eye = torch.eye(3, device=vertices.normal.device)
     return [torch.linalg.solve(H + 1e-6 * H.diagonal(dim1=1, dim2=2).mean() * eye, g[..., None])[..., 0] for H, g in sums]
 
 
@@ -55,7 +55,7 @@ def _step(
     sums = []
     for samples, of_view, rotation in zip(views, lights, rotations, strict=True):
         count = len(of_view.intensity)
-        H, g = torch.zeros(count, 3, 3), torch.zeros(count, 3)
+        H, g = samples.image.new_zeros(count, 3, 3), samples.image.new_zeros(count, 3)
         for part in samples.chunks():
             index, towards = samples.vertex[part], samples.towards[part]
             shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
@@ -81,26 +81,26 @@ def _from_product(m: torch.Tensor, rotation: torch.Tensor) -> DirectionalLights:
 
 
 def _as_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig: bool) -> Lights:
-    directions = [g.direction.double().numpy() for g in grey]
+    directions = [g.direction.double().cpu().numpy() for g in grey]
     unit = tuple(d / np.linalg.norm(d, axis=1, keepdims=True) for d in directions)
-    return Lights(unit, tuple(g.intensity.double().numpy()[:, None] * r for g, r in zip(grey, ratios, strict=True)), one_rig)
+    return Lights(unit, tuple(g.intensity.double().cpu().numpy()[:, None] * r for g, r in zip(grey, ratios, strict=True)), one_rig)
 
 
-def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: bool) -> Lights:
+def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: bool, device: torch.device) -> Lights:
     """Lights of all photographs of `capture` for a known surface and material. one_rig: its views share them."""
     torch.set_num_threads(1)
-    rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in capture.views]
+    rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32, device=device) for view in capture.views]
     # With the light at the camera no visible vertex is in shadow.
     from_camera = [np.tile(-view.camera.rotation[2], (len(view.lights), 1)) for view in capture.views]
     white = [np.ones_like(d) for d in from_camera]
-    views = observe(capture, surface, Lights(tuple(from_camera), tuple(white), one_rig), torch.device("cpu"))
-    vertices = _vertices(material)
+    views = observe(capture, surface, Lights(tuple(from_camera), tuple(white), one_rig), device)
+    vertices = _vertices(material, device)
     products = _lambertian(views, vertices, rotations, one_rig)
     grey = [_from_product(m, rotation) for m, rotation in zip(products, rotations, strict=True)]
     sources = coarse_sources(surface, material.albedo.mean(1)) if material.bounce else None
     for _ in range(2):
         lights = _as_lights(grey, [channel_ratio(e) for e in white], one_rig)
-        views = observe(capture, surface, lights, torch.device("cpu"))
+        views = observe(capture, surface, lights, device)
         if sources is not None:
             views = with_gathered(views, surface, sources, material.bounce, lights)
         for _ in range(STEPS):

@@ -151,12 +151,12 @@ def _table(of: Observed, views: list[ViewSamples], codes: Sequence[Tensor]) -> _
 
 def _begun(inputs_: int, generator: torch.Generator, like: Tensor) -> Layers:
     """Layers that answer 0."""
-    sizes = (inputs_, WIDTH, WIDTH)
-    hidden = [
-        ((2 * torch.rand(b, a, generator=generator) - 1) * a**-0.5, (2 * torch.rand(b, generator=generator) - 1) * a**-0.5)
-        for a, b in pairwise(sizes)
-    ]
-    return [(w.to(like), b.to(like)) for w, b in [*hidden, (torch.zeros(1, WIDTH), torch.zeros(1))]]
+
+    def uniform(reach: float, *size: int) -> Tensor:
+        return (2 * torch.rand(size, generator=generator, device=like.device) - 1) * reach
+
+    hidden = [(uniform(a**-0.5, b, a), uniform(a**-0.5, b)) for a, b in pairwise((inputs_, WIDTH, WIDTH))]
+    return [*hidden, (like.new_zeros(1, WIDTH), like.new_zeros(1))]
 
 
 def _trained(table: _Table, level: Tensor, generator: torch.Generator) -> Layers:
@@ -167,7 +167,7 @@ def _trained(table: _Table, level: Tensor, generator: torch.Generator) -> Layers
     adam, unit = Adam(parameters, (0.9, 0.99), 1e-8), level[table.vertex]
     with ThreadPoolExecutor(1) as pool:
         for step in range(STEPS):
-            rows = torch.randint(len(x), (BATCH,), generator=generator).to(x.device)
+            rows = torch.randint(len(x), (BATCH,), generator=generator, device=x.device)
             predicted = table.direct[rows] * log_factor(x[rows], layers).exp() + table.rest[rows]
             error = (predicted - table.image[rows]) / unit[rows]
             loss = (table.weight[rows] * (error**2 + KNEE**2).sqrt()).mean()
@@ -207,7 +207,7 @@ def neural_residual(of: Observed, relative: Tensor, poor: float, generator: np.r
     bad = torch.nonzero(relative > poor)[:, 0]
     if not float(relative.nanmedian()) > poor or len(bad) < LEAST_VERTICES:
         return Trial(NOT_TRIED, False, 0.0, 0.0, time.perf_counter() - start), None
-    seeded = torch.Generator().manual_seed(int(generator.integers(2**31)))
+    seeded = torch.Generator(bad.device).manual_seed(int(generator.integers(2**31)))
     order = torch.from_numpy(generator.permutation(len(bad))[: LEARN_VERTICES + JUDGE_VERTICES]).to(bad.device)
     judge, learn = (part.sort().values for part in order.tensor_split([len(order) * JUDGE_VERTICES // (LEARN_VERTICES + JUDGE_VERTICES)]))
     level = (of.vertices.scale / relative)[bad]

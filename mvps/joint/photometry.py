@@ -98,7 +98,7 @@ def _started(
 ) -> Vertices:
     """Vertices of the new mesh: from the nearest vertex of the last round's, or from the views' photometric stereo."""
     if carried is not None:
-        nearest = torch.from_numpy(cKDTree(carried[0].vertices).query(state.surface.vertices)[1])
+        nearest = torch.from_numpy(cKDTree(carried[0].vertices).query(state.surface.vertices)[1]).to(device)
         old = carried[1]
         return Vertices(old.normal[nearest], old.reflectance[nearest], old.scale[nearest])
     seen = [(s.vertex.cpu().numpy(), s.weight.cpu().numpy()) for s in state.views]
@@ -209,7 +209,8 @@ def photometric_round(
         lobes = _choose_model(
             state, capture, with_sources(few, state.lights, _sources(state, vertices)), vertices, tie, trial, task.sharpen
         )
-        vertices = replace(vertices, reflectance=vertices.reflectance[:, [0, *(1 + k for k in lobes)]])
+        columns = torch.tensor([0, *(1 + k for k in lobes)], device=device)
+        vertices = replace(vertices, reflectance=vertices.reflectance[:, columns])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights = vertices.normal, grey_lights(part_lights, device)
     vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS)
@@ -229,7 +230,7 @@ def photometric_round(
     state.under = thinned(capture, state.lights)
     of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))
-    state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, _sources(state, vertices), task.half)
+    state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, _sources(state, vertices), device, task.half)
     seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None

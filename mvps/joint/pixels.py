@@ -40,13 +40,14 @@ OWN_LIGHTS = 4
 """Lights of a view from which its pixels say something of their own: albedo and two angles of a normal are three unknowns."""
 
 
-def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: Int) -> ViewSamples:
+def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: Int, device: torch.device) -> ViewSamples:
     """Of some of the view's pixels, rows (n,), which show position (n, 3)."""
     image, usable = grey_radiance(view, intensity)
     image, data = image[rows], usable[rows] & ~shadow
     towards = view_directions(view.camera, position).astype(np.float32)
+    towards_, image_, data_ = (torch.from_numpy(a).to(device) for a in (towards, image, data))
     n = len(rows)
-    return ViewSamples(torch.arange(n), torch.from_numpy(towards), torch.ones(n), torch.from_numpy(image), torch.from_numpy(data))
+    return ViewSamples(torch.arange(n, device=device), towards_, torch.ones(n, device=device), image_, data_)
 
 
 def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
@@ -64,6 +65,7 @@ def pixel_normals(
     direction: Float,
     intensity: Float,
     quick: slice,
+    device: torch.device,
     every_other: bool,
 ) -> NormalMap:
     """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
@@ -75,16 +77,18 @@ def pixel_normals(
     points = points_under(caster, material, view.camera, view.pixels[chosen])
     hit = np.flatnonzero(points.hit)
     rows, shadow = chosen[hit], shadow_at(caster, points, direction)[hit]
-    samples = _samples(view, points.position[hit], shadow, intensity, rows)
+    samples = _samples(view, points.position[hit], shadow, intensity, rows, device)
     if sources is not None:
         G = at(sources, gathered(sources, direction, material.bounce), points.position[hit], points.mesh_normal[hit])
-        samples = replace(samples, gathered=torch.from_numpy(G))
+        samples = replace(samples, gathered=torch.from_numpy(G).to(device))
     known = np.column_stack([points.albedo.mean(1), points.specular_weight])[hit]
-    reflectance, normal, light = (torch.tensor(a, dtype=torch.float32) for a in (known, points.normal[hit], direction))
+    reflectance, normal, light, grey = (
+        torch.tensor(a, dtype=torch.float32, device=device) for a in (known, points.normal[hit], direction, intensity.mean(1))
+    )
     spread = torch.cat([ALBEDO_TIE * reflectance[:, :1], WEIGHT_TIE * (reflectance[:, :1] + reflectance[:, 1:])], 1)
     anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
-    lights = [DirectionalLights(light, torch.tensor(intensity.mean(1), dtype=torch.float32))]
-    state = Vertices(normal, reflectance, torch.full((len(hit),), float(reflectance[:, 0].median())))
+    lights = [DirectionalLights(light, grey)]
+    state = Vertices(normal, reflectance, reflectance[:, 0].median().expand(len(hit)))
     for _ in range(QUICK_STEPS):
         state = vertex_step([samples.of_lights(quick)], state, [lights[0].of(quick)], material.law, anchor, stated=False)
     state = vertex_step([samples], state, lights, material.law, anchor)
@@ -92,9 +96,9 @@ def pixel_normals(
     pixels = len(view.pixels)
     normals = np.tile(towards, (pixels, 1))
     albedo, certain = np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
-    normals[rows] = normalise(state.normal.double().numpy())
-    albedo[rows] = state.reflectance[:, :1].numpy() * _chroma(view, intensity, rows)
-    certain[rows] = confidence(state).numpy()
+    normals[rows] = normalise(state.normal.double().cpu().numpy())
+    albedo[rows] = state.reflectance[:, :1].cpu().numpy() * _chroma(view, intensity, rows)
+    certain[rows] = confidence(state).cpu().numpy()
     if len(view.lights) < OWN_LIGHTS:
         # What is known comes from the vertex, which other views saw under other lights.
         certain[rows] = np.maximum(certain[rows], points.confidence[hit])
@@ -102,13 +106,19 @@ def pixel_normals(
 
 
 def all_pixel_normals(
-    capture: Capture, surface: Surface, material: Material, lights: Lights, sources: Sources | None, every_other: bool = False
+    capture: Capture,
+    surface: Surface,
+    material: Material,
+    lights: Lights,
+    sources: Sources | None,
+    device: torch.device,
+    every_other: bool = False,
 ) -> tuple[NormalMap, ...]:
     """`pixel_normals` of every view, on all cores."""
     caster, quick = ray_caster(surface), kept([len(view.lights) for view in capture.views])
 
     def one(i: int) -> NormalMap:
         of_view = capture.views[i], caster, sources, material, lights.direction[i], lights.intensity[i]
-        return pixel_normals(*of_view, quick[i], every_other)
+        return pixel_normals(*of_view, quick[i], device, every_other)
 
     return tuple(on_cores(one, range(len(capture.views))))

@@ -40,7 +40,7 @@ from mvps.joint.vertices import Agreement, agreement, fuse, with_masks
 from mvps.material import Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
-from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Residual, Surface
+from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Residual, Surface
 from mvps.silhouette import mask_distance
 
 NORMAL_SIGMA = 0.03
@@ -115,13 +115,6 @@ class Refined:
     carried: tuple[Surface, Vertices] | None = None
 
 
-def chosen_device(device: str) -> str:
-    """ "cpu" or "cuda" for auto, cpu or cuda; CaptureError where cuda is asked for and not there."""
-    if device == "cuda" and not torch.cuda.is_available():
-        raise CaptureError("--device: wanted a CUDA device, given a machine on which torch finds none; use --device cpu or auto")
-    return "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
-
-
 def _moved(
     surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
 ) -> Surface:
@@ -169,7 +162,7 @@ def refine(
     law: Law,
     settings: RefineSettings,
     seed: int,
-    device: str,
+    device: torch.device,
     on_round: Callable[[int, dict[str, float]], None],
     carried: tuple[Surface, Vertices] | None = None,
 ) -> Refined:
@@ -179,7 +172,6 @@ def refine(
     on_round(number from 1, what changed) is called after each round.
     """
     generator = np.random.default_rng(seed)
-    on = torch.device(device)
     torch.set_num_threads(1)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
     state = State(surface, lights, maps, law)
@@ -195,7 +187,7 @@ def refine(
         leaves_surface = settings.for_field and not pending
         if round_settings.photometric:
             every_light = settings.in_full and not pending
-            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, leaves_surface, on)
+            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, leaves_surface, device)
             changes = photometric_round(state, capture, task, carried, generator)
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
@@ -211,7 +203,7 @@ def refine(
         before = round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
-    return replace(_finished(state, settings.final, account, on, generator), carried=carried)
+    return replace(_finished(state, settings.final, account, device, generator), carried=carried)
 
 
 def _finished(
