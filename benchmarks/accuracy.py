@@ -1,11 +1,11 @@
 """Figures per capture: reconstruct through the command line, evaluate, and keep a table.
 
-    python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard] [--repeats 3]
+    python benchmarks/accuracy.py CAPTURES [CASE ...] [--preset standard] [--repeats 3] [--device cuda]
 
 CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures; `large` is made for the purpose
-where it is not there, and thrown away. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file, where cases of earlier runs
-stay: errors against ground truth (which the reconstruction never reads), seconds of the whole command, and its largest resident set,
-with the machine named.
+where it is not there, and thrown away. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file (accuracy-PRESET-cuda on
+CUDA), where cases of earlier runs stay: errors against ground truth (which the reconstruction never reads), seconds of the whole
+command, and its largest resident set, with the machine named.
 """
 
 from __future__ import annotations
@@ -57,14 +57,19 @@ COLUMNS = (
 )
 
 
-def machine() -> str:
-    """Processor, cores and Python's version."""
+def machine(device: str) -> str:
+    """Processor, cores and Python's version; on CUDA the GPU and torch's version too."""
     lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "")
-    return f"{model or platform.processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
+    found = f"{model or platform.processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}"
+    if device == "cpu":
+        return found
+    import torch
+
+    return f"{torch.cuda.get_device_name()}, {found}, torch {torch.__version__}"
 
 
-def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) -> dict[str, Any]:
+def measure(name: str, captures: Path, preset: str, device: str, folder: Path, repeats: int) -> dict[str, Any]:
     """One row: the figures of one case; seconds are the median of `repeats` runs."""
     capture, options = captures / CASES[name][0], CASES[name][1]
     if capture.name in MADE and not capture.exists():
@@ -77,8 +82,8 @@ def measure(name: str, captures: Path, preset: str, folder: Path, repeats: int) 
     seconds, peaks = [], []
     for _ in range(repeats):
         start = time.perf_counter()
-        command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet", *options]
-        peaks.append(peak_mb([sys.executable, *command]))
+        command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--device", device, "--quiet"]
+        peaks.append(peak_mb([sys.executable, *command, *options]))
         seconds.append(time.perf_counter() - start)
     command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture), "--json", str(figures)]
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
@@ -129,19 +134,22 @@ def main() -> None:
     parser.add_argument("captures", type=Path)
     parser.add_argument("cases", nargs="*", help=" ".join(CASES))
     parser.add_argument("--preset", default="standard")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where torch computes")
     parser.add_argument("--repeats", type=int, default=1, help="runs of each case; the table says how many, and has their median time")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = [measure(name, given.captures, given.preset, Path(folder), given.repeats) for name in given.cases or CASES]
-    stem = HERE / f"accuracy-{given.preset}"
+        rows = [measure(name, given.captures, given.preset, given.device, Path(folder), given.repeats) for name in given.cases or CASES]
+    suffix, option = ("", "") if given.device == "cpu" else (f"-{given.device}", f" --device {given.device}")
+    stem = HERE / f"accuracy-{given.preset}{suffix}"
     if stem.with_suffix(".json").exists():
         before = {row["case"]: row for row in json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"]}
         found = before | {row["case"]: row for row in rows}
         rows = [found[name] for name in CASES if name in found]
-    record = {"machine": machine(), "preset": given.preset, "rows": rows}
+    found_on = machine(given.device)
+    record = {"machine": found_on, "preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset}"
-    text = f"`{command}` on {machine()}; s is the median of the runs.\n\n{table(rows)}\n"
+    command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset}{option}"
+    text = f"`{command}` on {found_on}; s is the median of the runs.\n\n{table(rows)}\n"
     stem.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 
