@@ -54,6 +54,13 @@ def face_areas(surface: Surface) -> Float:
     return areas
 
 
+def vertex_areas(surface: Surface) -> Float:
+    """(V,) a third of the faces at each vertex: they sum to the surface's area."""
+    areas = np.zeros(len(surface.vertices))
+    np.add.at(areas, surface.faces, face_areas(surface)[:, None] / 3)
+    return areas
+
+
 _normals: WeakKeyDictionary[Surface, Float] = WeakKeyDictionary()
 
 

@@ -13,10 +13,17 @@ view are needed, n . l, v . l and n . v; everything else is elementwise on (poin
 
 from __future__ import annotations
 
+import functools
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvps.scene import GRAZING_POWER, Law
+
+QUADRATURE = 64
+"""Nodes of Gauss and Legendre: enough for sharpness up to 10^4."""
 
 PARALLEL = 1e-6
 """Floor of 2 + 2 v.l: view and light exactly opposite have no half vector (and such a point is never lit and seen)."""
@@ -30,6 +37,19 @@ def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor
 def lobes(h_dot_n: Tensor, sharpness: Tensor) -> Tensor:
     """(..., lobes) exp(sharpness (h . n - 1)) for h . n (...) and sharpness (lobes,)."""
     return torch.exp(sharpness * (h_dot_n[..., None] - 1))
+
+
+@functools.cache
+def returned(sharpness: tuple[float, ...]) -> NDArray[np.float64]:
+    """(1 + lobes,) what a point returns of light from everywhere, over that of a white diffuse one, by its albedo and weights, seen from
+    above: 1 for the albedo, and for a lobe, with u = h.n,
+
+        1/pi int exp(s (h.n - 1)) n.l dl = 8 int exp(s (u - 1)) (2 u^2 - 1) u du from sqrt(1/2) to 1
+    """
+    u, weight = np.polynomial.legendre.leggauss(QUADRATURE)
+    low = np.sqrt(0.5)
+    u = low + (1 - low) * (u + 1) / 2
+    return np.array([1.0, *(4 * (1 - low) * float(weight @ (np.exp(s * (u - 1)) * (2 * u**2 - 1) * u)) for s in sharpness)])
 
 
 def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_weight: Tensor, law: Law) -> Tensor:

@@ -3,8 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from mvps.joint.blocks import Vertices
+from mvps.joint.lights import subset
+from mvps.joint.observe import ViewSamples
+from mvps.joint.patches import Patches, drawn_patches
+from mvps.joint.steps import Anchor
+from mvps.mesh import vertex_normals
 from mvps.scene import Camera, Float, Surface
 
 
@@ -33,3 +40,12 @@ def linear_from_srgb(encoded: NDArray[np.uint8]) -> Float:
     """Linear values in [0, 1] of 8-bit sRGB."""
     x = np.asarray(encoded, np.float64) / 255
     return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def in_patches(
+    surface: Surface, views: list[ViewSamples], vertices: Vertices, anchor: Anchor
+) -> tuple[list[ViewSamples], Vertices, Anchor, Patches]:
+    """The joint problem on patches of the vertices that are seen."""
+    seen = torch.cat([s.vertex for s in views]).unique().cpu().numpy()
+    patches = drawn_patches(seen, surface, vertex_normals(surface), len(seen), np.random.default_rng(0), vertices.normal.device)
+    return *subset(views, vertices, anchor, patches.vertex), patches

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from references import in_patches
 from simulated_device import SIMULATED, simulated_device
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
@@ -137,8 +138,9 @@ def test_vertices_and_lights(scene: SphereScene, device: torch.device) -> None:
         seen = views[0].vertex
         shaded = evaluate(vertices.normal[seen], vertices.reflectance[seen], views[0].towards, lights[0], law)
         equations = vertex_equations(views, vertices, lights, law)
-        stepped, _ = light_step(views, vertices, lights, law, tie, rotations, True)
-        results.append((shaded, equations, stepped, vertex_step(views, vertices, lights, law, tie)))
+        views, vertices, tie, patches = in_patches(scene.reconstruction.surface, views, vertices, tie)
+        stepped, _ = light_step(views, vertices, lights, law, tie, patches, rotations, True)
+        results.append((shaded, equations, stepped, vertex_step(views, vertices, lights, law, tie, patches=patches)))
     same(*results, device)
 
 

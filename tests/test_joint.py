@@ -11,6 +11,7 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from references import in_patches
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.joint import vertices
@@ -152,12 +153,13 @@ def test_lights_stay_at_the_truth_and_come_back_to_it(scene: SphereScene, start:
             for r, of_view in zip(rotations_, truth, strict=True)
         ]
     # The anchor is the smooth sphere: true on average, some degrees off at every vertex.
-    anchor = free_reflectance(torch.tensor(vertex_normals(scene.reconstruction.surface), dtype=torch.float32), 0.05, 3)
+    anchor = free_reflectance(torch.tensor(vertex_normals(scene.reconstruction.surface), dtype=torch.float32), 0.3, 3)
+    views, vertices, anchor, patches = in_patches(scene.reconstruction.surface, views, vertices, anchor)
     for _ in range(8):
-        lights, law = light_step(views, vertices, lights, law, anchor, rotations_, one_rig)
+        lights, law = light_step(views, vertices, lights, law, anchor, patches, rotations_, one_rig)
         lights, vertices = with_mean_one(lights, vertices)
         for _ in range(2):
-            vertices = vertex_step(views, vertices, lights, law, anchor)
+            vertices = vertex_step(views, vertices, lights, law, anchor, patches=patches)
     assert light_error(lights, truth) < 0.5
 
 
@@ -166,8 +168,8 @@ def test_light_step_is_finite_with_a_single_light(scene: SphereScene) -> None:
     few = [replace(s, image=s.image[:, :1], data=s.data[:, :1]) for s in views]
     lights = [DirectionalLights(of_view.direction[:1], of_view.intensity[:1]) for of_view in truth]
     rotations_ = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
-    anchor = free_reflectance(vertices.normal, 0.05, 3)
-    stepped, _ = light_step(few, vertices, lights, law, anchor, rotations_, True)
+    few, vertices, anchor, patches = in_patches(scene.reconstruction.surface, few, vertices, free_reflectance(vertices.normal, 0.05, 3))
+    stepped, _ = light_step(few, vertices, lights, law, anchor, patches, rotations_, True)
     assert all(torch.isfinite(of_view.direction).all() and torch.isfinite(of_view.intensity).all() for of_view in stepped)
     state = vertex_step(few, vertices, lights, law, anchor)
     assert torch.isfinite(state.normal).all() and torch.isfinite(state.reflectance).all() and (state.reflectance >= 0).all()
@@ -267,8 +269,11 @@ def test_steps_of_rank_deficient_problems_are_finite(scene: SphereScene, case: s
         assert torch.allclose(state.normal.norm(dim=1), torch.tensor(1.0), atol=1e-5)
     certain = stated_confidence(state, 0.3, torch.tensor([[0, 1]]))
     assert torch.isfinite(certain).all() and (certain >= 0).all() and (certain <= 1).all()
+    few, state, anchor, patches = in_patches(scene.reconstruction.surface, few, state, anchor)
+    state = vertex_step(few, state, lights[:1], law, anchor, patches=patches)
+    assert all(torch.isfinite(t).all() for t in (state.normal, state.reflectance, state.scale))
     rotation = [torch.tensor(scene.capture.views[0].camera.rotation, dtype=torch.float32)]
-    stepped, _ = light_step(few, state, lights[:1], law, anchor, rotation, False)
+    stepped, _ = light_step(few, state, lights[:1], law, anchor, patches, rotation, False)
     assert torch.isfinite(stepped[0].direction).all() and torch.isfinite(stepped[0].intensity).all()
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from references import in_patches
 from sphere_scene import SphereScene, make_sphere
 
 from mvps.joint.blocks import Vertices
@@ -75,5 +76,6 @@ def test_lobes_are_kept_on_a_glossy_ball_alone(scene: SphereScene, glossy: bool)
     start = Vertices(normal, albedo, albedo[:, 0].clone())
     tie = free_reflectance(normal, 0.05, 1)
     rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
-    model, _ = choose((12.0, 60.0), lambda m: held_out_errors(views, start, lights, tie, rotations, m), ())
+    views, start, tie, patches = in_patches(r.surface, views, start, tie)
+    model, _ = choose((12.0, 60.0), lambda m: held_out_errors(views, start, lights, tie, patches, rotations, m), ())
     assert (len(model.sharpness) > 0) == glossy

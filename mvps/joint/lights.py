@@ -6,9 +6,11 @@ are eliminated. With unknowns m (all lights) and x_j (vertex j: normal, albedo, 
     [ H_mm   H_mx ] [dm]     [g_m]                     S  = H_mm - sum_j H_mj (H_jj + P_j)^-1 H_jm
     [ H_xm  H_xx+P] [dx] = - [g_x]      reduces to     S dm = -(g_m - sum_j H_mj (H_jj + P_j)^-1 g_j)
 
-(Schur complement, as in bundle adjustment: Triggs et al. 2000). P_j ties the vertex's normal to the mesh's normal: without it the lights
-slide along the generalised bas-relief family (Belhumeur et al. 1999) that no image can tell. It counts once per sample (steps.py) and
-redescends beyond FAR_OFF, where the mesh is not yet the surface.
+(Schur complement, as in bundle adjustment: Triggs et al. 2000), P_j the ties of steps.py. The vertices come in patches that keep their
+mean slope (patches.py), which adds two multipliers each: with A_j, c, E there and F = sum_j A_j H_jj^-1 H_jm, f = sum_j A_j H_jj^-1 g_j
+
+    S <- S + F^T E^-1 F,        right-hand side <- right-hand side - F^T E^-1 (f - c)
+
 Weights at their bound whose gradient keeps them there are no unknowns. A few thousand vertices say all there is to say about the lights,
 three unknowns each.
 
@@ -24,8 +26,10 @@ from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_derivatives
 from mvps.joint.observe import ViewSamples
+from mvps.joint.patches import Patches
 from mvps.joint.steps import LARGEST_TURN, Anchor
 from mvps.scene import Law
+from mvps.shading import returned
 
 VERTICES_PER_BLOCK = 256
 
@@ -34,9 +38,6 @@ OF_LAW = 2
 
 LARGEST_GRAZING = 0.9
 """Of the diffuse term's relative change at 90 degrees: none absorbs all there, none doubles."""
-
-FAR_OFF = 0.05
-"""Radians between mesh and refined normal beyond which the mesh's normal is an outlier rather than noise."""
 
 
 def on_some(views: list[ViewSamples], vertices: Vertices, chosen: Tensor) -> tuple[list[ViewSamples], Vertices]:
@@ -127,27 +128,40 @@ def _coupled(
     return lights_hessian, lights_gradient, hessian, gradient, cross, samples_of
 
 
-def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, solved: tuple[bool, bool]) -> Tensor:
+def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, bool]) -> Tensor:
     """dm of the Schur complement. solved: grazing, bounce."""
     H, g, hessian, gradient, cross, samples_of = parts
     away = vertices.normal - anchor.normal
-    strength = samples_of * (1 + away.square().sum(1) / FAR_OFF**2) ** -2 / anchor.sigma**2
     for k, tangent in enumerate(tangents(vertices.normal)):
-        hessian[:, k, k] += strength
-        gradient[:, k] += strength * (away * tangent).sum(1)
+        hessian[:, k, k] += samples_of / anchor.sigma**2
+        gradient[:, k] += samples_of / anchor.sigma**2 * (away * tangent).sum(1)
     held = torch.zeros_like(gradient)
     held[:, 2:] = ((vertices.reflectance <= 0) & (gradient[:, 2:] >= 0)).to(held.dtype)
     free = 1 - held
     hessian = hessian * free[:, :, None] * free[:, None, :] + torch.diag_embed(held)
     hessian = hessian + torch.diag_embed(1e-6 * torch.diagonal(hessian, dim1=1, dim2=2) + 1e-12)
+    moved, A = patches.moved(vertices.normal)
+    E, F, f = (H.new_zeros(patches.count, 2, *shape) for shape in ((2,), (len(g),), ()))
     for start in range(0, len(hessian), VERTICES_PER_BLOCK):
         part = slice(start, start + VERTICES_PER_BLOCK)
         L = torch.linalg.cholesky(hessian[part].double())
         coupled = (cross[part] * free[part][..., None]).double()
-        half = torch.linalg.solve_triangular(L, coupled, upper=False).reshape(-1, len(g))
-        right = torch.linalg.solve_triangular(L, (gradient[part] * free[part]).double()[..., None], upper=False).reshape(-1)
+        half = torch.linalg.solve_triangular(L, coupled, upper=False)
+        right = torch.linalg.solve_triangular(L, (gradient[part] * free[part]).double()[..., None], upper=False)
+        # L^-1 of the normals' columns: products of two such halves have the inverse of the whole block between them.
+        normals = torch.linalg.solve_triangular(
+            L, torch.eye(L.shape[1], 2, dtype=L.dtype, device=L.device).expand(len(L), -1, -1), upper=False
+        )
+        normals = normals @ A[part].transpose(1, 2)
+        E.index_add_(0, patches.of[part], normals.transpose(1, 2) @ normals)
+        F.index_add_(0, patches.of[part], normals.transpose(1, 2) @ half)
+        f.index_add_(0, patches.of[part], (normals.transpose(1, 2) @ right)[..., 0])
+        half, right = half.reshape(-1, len(g)), right.reshape(-1)
         H -= half.T @ half
         g -= half.T @ right
+    of_patches = torch.linalg.solve(E, torch.cat([F, (f - patches.summed(moved))[..., None]], 2))
+    H += torch.einsum("kim,kin->mn", F, of_patches[..., :-1])
+    g += torch.einsum("kim,ki->m", F, of_patches[..., -1])
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
     diagonal = torch.diagonal(H).clamp_min(0)
     H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max() + torch.finfo(H.dtype).tiny ** 0.5)
@@ -164,6 +178,7 @@ def light_step(
     lights: list[DirectionalLights],
     law: Law,
     anchor: Anchor,
+    patches: Patches,
     rotations: list[Tensor],
     one_rig: bool,
     free: tuple[bool, bool, bool] = (True, True, True),
@@ -174,8 +189,9 @@ def light_step(
     """
     layout = _layout(lights, one_rig, free[0])
     parts = _coupled(views, vertices, lights, law, rotations, layout)
-    step = _reduced_step(parts, vertices, anchor, free[1:])
-    law = _stepped_law(law, step[layout.total :], float(vertices.reflectance[:, 0].median()))
+    step = _reduced_step(parts, vertices, anchor, patches, free[1:])
+    level = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness))).median())
+    law = _stepped_law(law, step[layout.total :], level)
     if not layout.total:
         return lights, law
     stepped = []
@@ -190,10 +206,10 @@ def light_step(
     return stepped, law
 
 
-def _stepped_law(law: Law, step: Tensor, albedo: float) -> Law:
-    """The law after a step, within LARGEST_GRAZING and so that a point of median albedo reflects no more than it receives."""
+def _stepped_law(law: Law, step: Tensor, most: float) -> Law:
+    """The law after a step, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
     grazing, bounce = (float(value) for value in torch.tensor([law.grazing, law.bounce], dtype=step.dtype) + step.cpu())
-    return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=min(max(bounce, 0.0), 1 / max(albedo, 1e-300)))
+    return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=min(max(bounce, 0.0), 1 / max(most, 1e-300)))
 
 
 def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:

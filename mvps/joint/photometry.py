@@ -20,6 +20,7 @@ from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
+from mvps.joint.patches import VERTICES_OF_PATCH, Patches, drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
@@ -32,17 +33,18 @@ from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 SHARPNESS = (8.0, 32.0, 128.0)
 """Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
 
-LIGHT_VERTICES, TRIAL_VERTICES = 2000, 1000
-"""Vertices that stand for all when lights are solved, and when components of the model are tried."""
+LIGHT_VERTICES, TRIAL_VERTICES = 4000, 1000
+"""Vertices, in patches, that stand for all when lights are solved, and when components of the model are tried."""
 
 MATERIAL_STEPS, CARRIED_STEPS = 3, 2
 LIGHT_STEPS = 3
 WEAK_TIE = 0.3
 """Standard deviation, radians, of refined normals from the mesh's in the vertices' own steps: it only speaks where samples do not."""
 
-LIGHT_TIE = 0.01
-"""The same while the lights are solved. What all vertices' normals have in common is known from the mesh far better than from images, whose
-model is wrong alike for all of them; noise of single vertices averages out."""
+
+LIGHT_TIE = 1.0
+"""The same while the lights are solved: as far as a normal may be from another that the same camera sees. Patches hold what normals have in
+common (patches.py); ties of single normals hold lights to the mesh's errors."""
 
 
 @dataclass
@@ -123,34 +125,46 @@ def drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) 
 
 
 def _choose_model(
-    state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, some: torch.Tensor, sharpen: bool
+    state: State,
+    capture: Capture,
+    few: list[ViewSamples],
+    start: Vertices,
+    anchor: Anchor,
+    patches: Patches,
+    sharpen: bool,
 ) -> list[int]:
     """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account. Which of the
     state's lobes stay."""
-    few, part, tie = subset(few, start, anchor, some)
-    rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
-    lights, law = grey_lights(state.lights, some.device), state.law
-    errors = partial(held_out_errors, few, part, lights, tie, rotations)
+    few, part, tie = subset(few, start, anchor, patches.vertex)
+    rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
+    lights, law = grey_lights(state.lights, patches.vertex.device), state.law
+    errors = partial(held_out_errors, few, part, lights, tie, patches, rotations)
     state.model, state.trials = choose(law.sharpness, errors, sharpen=sharpen)
     state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
     return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
 
 
 def _solve_lights(
-    state: State, capture: Capture, few: list[ViewSamples], vertices: Vertices, anchor: Anchor, some: torch.Tensor, free_lights: bool
+    state: State,
+    capture: Capture,
+    few: list[ViewSamples],
+    vertices: Vertices,
+    anchor: Anchor,
+    patches: Patches,
+    free_lights: bool,
 ) -> tuple[Lights, float]:
-    """The lights solved on some vertices, which are solved along; mean turn of the directions in the last step, deg."""
-    few, part, tie = subset(few, vertices, anchor, some)
-    rotations = [_tensor(view.camera.rotation, some.device) for view in capture.views]
-    lights = grey_lights(state.lights, some.device)
+    """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg."""
+    few, part, tie = subset(few, vertices, anchor, patches.vertex)
+    rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
+    lights = grey_lights(state.lights, patches.vertex.device)
     free = (free_lights, state.model.grazing, state.model.bounce)
     before = lights
     for _ in range(LIGHT_STEPS):
         before = lights
-        lights, state.law = light_step(few, part, lights, state.law, tie, rotations, state.lights.one_rig, free)
+        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, state.lights.one_rig, free)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
-            part = vertex_step(few, part, lights, state.law, tie)
+            part = vertex_step(few, part, lights, state.law, tie, patches=patches)
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
     return solved, float(np.concatenate(turned).mean())
@@ -191,11 +205,12 @@ def photometric_round(
     state.views = observe(part, state.surface, part_lights, device)
     mesh_normal = vertex_normals(state.surface)
     vertices = _started(state, part, part_lights, mesh_normal, carried, device)
-    some = drawn(state.views, LIGHT_VERTICES, generator)
+    seen = torch.cat([samples.vertex for samples in state.views]).unique().cpu().numpy()
+    patches = drawn_patches(seen, state.surface, mesh_normal, LIGHT_VERTICES, generator, device)
     few = state.views
     if part is not capture:
         among = np.zeros(len(mesh_normal), bool)
-        among[some.cpu().numpy()] = True
+        among[patches.vertex.cpu().numpy()] = True
         few = observe(capture, state.surface, state.lights, device, among)
     if state.coarse is None:
         state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
@@ -205,10 +220,9 @@ def photometric_round(
 
     if task.choose and not state.trials:
         tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
-        trial = drawn(few, TRIAL_VERTICES, generator)
-        lobes = _choose_model(
-            state, capture, with_sources(few, state.lights, _sources(state, vertices)), vertices, tie, trial, task.sharpen
-        )
+        tried = patches.first(TRIAL_VERTICES // VERTICES_OF_PATCH)
+        lit = with_sources(few, state.lights, _sources(state, vertices))
+        lobes = _choose_model(state, capture, lit, vertices, tie, tried, task.sharpen)
         columns = torch.tensor([0, *(1 + k for k in lobes)], device=device)
         vertices = replace(vertices, reflectance=vertices.reflectance[:, columns])
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
@@ -218,7 +232,7 @@ def photometric_round(
     state.views = with_sources(state.views, part_lights, sources)
     few = state.views if part is capture else with_sources(few, state.lights, sources)
     free = with_population(vertices, free)
-    solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), some, task.free_lights)
+    solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), patches, task.free_lights)
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
@@ -226,12 +240,11 @@ def photometric_round(
     last = vertices.normal
     vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
-    state.lights = _with_colours(state, capture, few, some)
+    state.lights = _with_colours(state, capture, few, patches.vertex)
     state.under = thinned(capture, state.lights)
     of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))
     state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, _sources(state, vertices), device, task.half)
-    seen = torch.cat([s.vertex for s in state.views]).unique().cpu().numpy()
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None
     stated = np.degrees(vertices.sigma.cpu().numpy()[seen])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tangents, vertex_equations
 from mvps.joint.observe import ViewSamples
+from mvps.joint.patches import Patches, held
 from mvps.scene import RELIABLE, Law
 from solvers.least_squares import bounded_step, columns_of_inverse
 
@@ -90,9 +91,16 @@ def add_ties(equations: NormalEquations, vertices: Vertices, anchor: Anchor) -> 
 
 
 def vertex_step(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, stated: bool = True
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    anchor: Anchor,
+    stated: bool = True,
+    patches: Patches | None = None,
 ) -> Vertices:
-    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed. stated: and sigma, a fifth of the time."""
+    """One Gauss-Newton step of every vertex for fixed lights; the scale of residuals is renewed. stated: and sigma, a fifth of the time;
+    patches: keep their mean slope."""
     equations = vertex_equations(views, vertices, lights, law)
     scale = (equations.squares / equations.count.clamp_min(1e-6)).sqrt()
     vertices = replace(vertices, scale=scale.clamp_min(_least_scale(scale[equations.count > 0], vertices.reflectance[:, 0])))
@@ -100,6 +108,8 @@ def vertex_step(
     add_ties(equations, vertices, anchor)
     lower = torch.cat([torch.full_like(vertices.normal[:, :2], -torch.inf), -vertices.reflectance], 1)
     step = bounded_step(equations.hessian, equations.gradient, lower)
+    if patches is not None:
+        step = held(step, equations.hessian, vertices, patches)
     turn = step[:, :2]
     turn = turn * (LARGEST_TURN / turn.norm(dim=1, keepdim=True).clamp_min(LARGEST_TURN))
     first, second = tangents(vertices.normal)

@@ -15,6 +15,7 @@ from torch import Tensor
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
 from mvps.joint.lights import light_step
 from mvps.joint.observe import ViewSamples
+from mvps.joint.patches import Patches
 from mvps.joint.steps import Anchor, vertex_step
 from mvps.material import Model
 from mvps.scene import Float, Law
@@ -34,11 +35,17 @@ def parted(views: list[ViewSamples]) -> tuple[list[ViewSamples], list[ViewSample
 
 
 def held_out_errors(
-    views: list[ViewSamples], start: Vertices, lights: list[DirectionalLights], anchor: Anchor, rotations: list[Tensor], model: Model
+    views: list[ViewSamples],
+    start: Vertices,
+    lights: list[DirectionalLights],
+    anchor: Anchor,
+    patches: Patches,
+    rotations: list[Tensor],
+    model: Model,
 ) -> Float:
     """(V,) mean absolute error of the held-out samples over their mean value, NaN for a vertex without any.
 
-    start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals.
+    start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope.
     """
     fitted, kept = parted(views)
     unknowns = 1 + len(model.sharpness)
@@ -47,11 +54,11 @@ def held_out_errors(
     free = replace(anchor, reflectance=torch.zeros_like(reflectance), reflectance_sigma=torch.full_like(reflectance, torch.inf))
     law = Law(model.sharpness)
     for _ in range(VERTEX_STEPS):
-        state = vertex_step(fitted, state, lights, law, free)
+        state = vertex_step(fitted, state, lights, law, free, patches=patches)
     for _ in range(LAW_STEPS if model.grazing or model.bounce else 0):
-        _, law = light_step(fitted, state, lights, law, free, rotations, False, (False, model.grazing, model.bounce))
+        _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, (False, model.grazing, model.bounce))
         for _ in range(2):
-            state = vertex_step(fitted, state, lights, law, free)
+            state = vertex_step(fitted, state, lights, law, free, patches=patches)
     error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)
     for samples, of_view in zip(kept, lights, strict=True):
         for part in samples.chunks():
