@@ -15,7 +15,7 @@ from references import in_patches
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.joint import vertices
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_derivatives, vertex_equations
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights
@@ -31,54 +31,6 @@ CPU = torch.device("cpu")
 
 def degrees(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
-
-
-SITUATIONS = {
-    "facing light": ((0.1, 0.0, 1.0), (0.3, 0.2, 1.0), 20.0),
-    "grazing light": ((0.1, 0.0, 1.0), (1.0, 0.1, 0.02), 20.0),
-    "grazing view": ((1.0, 0.0, 0.1), (0.6, 0.3, 1.0), 20.0),
-    "sharp lobe at its peak": ((0.1, 0.05, 1.0), (0.2, 0.1, 1.0), 300.0),
-    "attached shadow": ((0.1, 0.0, 1.0), (1.0, 0.0, -0.3), 20.0),
-}
-
-
-@pytest.mark.parametrize("situation", SITUATIONS)
-def test_derivatives_against_finite_differences(situation: str) -> None:
-    *directions, sharpness = SITUATIONS[situation]
-    normal, light = (torch.tensor(v, dtype=torch.float64) for v in directions)
-    normal, light = (torch.nn.functional.normalize(v, dim=0)[None] for v in (normal, light))
-    view = torch.nn.functional.normalize(torch.tensor([[0.05, 0.1, 1.0]], dtype=torch.float64), dim=1)
-    reflectance = torch.tensor([[0.4, 0.3]], dtype=torch.float64)
-    intensity, gathered = torch.tensor([1.3], dtype=torch.float64), torch.tensor([[0.2]], dtype=torch.float64)
-    law = Law((sharpness,), -0.3, 0.7)
-    frame = tangents(normal)
-
-    def image(turn: torch.Tensor, values: torch.Tensor, m: torch.Tensor) -> torch.Tensor:
-        turned = torch.nn.functional.normalize(normal + turn[:1] * frame[0] + turn[1:] * frame[1], dim=1)
-        length = m.norm(dim=1)
-        return evaluate(turned, values, view, DirectionalLights(m / length[:, None], length), law, gathered).predicted[0, 0]
-
-    lights = DirectionalLights(light, intensity)
-    shaded = evaluate(normal, reflectance, view, lights, law, gathered)
-    by_vertex = torch.stack(vertex_derivatives(shaded, frame, view, lights), 1)[0, :, 0]
-    by_light = light_jacobian(shaded, normal, view, lights, law, torch.eye(3, dtype=torch.float64))[0, 0]
-    zero = torch.zeros(2, dtype=torch.float64)
-    numeric = torch.autograd.functional.jacobian(image, (zero, reflectance, light * intensity))
-    assert torch.allclose(by_vertex, torch.cat([numeric[0], numeric[1][0]]), atol=1e-10)
-    assert torch.allclose(by_light, numeric[2][0], atol=1e-10)
-    step = 1e-6
-    by_law = (shaded.grazing, shaded.indirect)
-    for name, derivative in zip(("grazing", "bounce"), by_law, strict=True):
-        after, before = (
-            evaluate(normal, reflectance, view, lights, replace(law, **{name: getattr(law, name) + s}), gathered).predicted
-            for s in (step, -step)
-        )
-        assert abs((after - before) / (2 * step) - derivative) < 1e-8
-    for k in range(2):
-        turn = torch.zeros(2, dtype=torch.float64)
-        turn[k] = step
-        difference = (image(turn, reflectance, light * intensity) - image(-turn, reflectance, light * intensity)) / (2 * step)
-        assert abs(difference - by_vertex[k]) < 1e-6
 
 
 def test_tangents_complete_a_frame_everywhere() -> None:
