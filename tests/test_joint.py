@@ -18,7 +18,7 @@ from mvps.joint import vertices
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, observe
-from mvps.joint.photometry import grey_lights
+from mvps.joint.photometry import grey_lights, of_one_normal
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.steps import free_reflectance, stated_confidence, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
@@ -198,6 +198,17 @@ def test_stated_confidence_knows_the_tie_and_the_meshs_own_coarseness() -> None:
     bent = torch.nn.functional.normalize(flat + torch.tensor([[0.0], [0.4], [0.0], [0.0]]) * torch.tensor([1.0, 0, 0]), dim=1)
     rougher = stated_confidence(replace(vertices, normal=bent), 0.3, pairs)
     assert (rougher[:3] < stated_confidence(vertices, 0.3, pairs)[:3]).all()
+
+
+def test_pixels_of_a_fold_show_more_than_one_normal() -> None:
+    """In any unit: a sphere of 20 pixels radius bends by a twentieth of a radian in a pixel. What is within half a pixel is not seen."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=20.0)
+    for unit in (1.0, 1e-3):
+        surface = Surface(np.array(ball.vertices) * unit, np.array(ball.faces))
+        normal = torch.tensor(vertex_normals(surface), dtype=torch.float32)
+        found, coarse = (of_one_normal(surface, normal, pixel * unit, 128.0) for pixel in (1.0, 100.0))
+        assert torch.allclose(found, torch.tensor(1 / (1 + 128 / 20**2)), rtol=0.01)
+        assert coarse.mean() > 5 / (1 + 128 * 5**2)
 
 
 DEGENERATE = {

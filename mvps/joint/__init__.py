@@ -4,6 +4,7 @@ observe.py      what the photographs say about the vertices
 thinned.py      fewer lights of every view
 blocks.py       the image model's derivatives and normal equations
 steps.py        steps of the vertices, ties, confidence
+patches.py      patches of the mesh whose mean slope is known
 lights.py       lights with the vertices eliminated
 trial.py        held-out errors of a reflectance model
 pixels.py       normals of single views at their pixels

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
+from mvps.camera import pixel_footprint
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
@@ -23,11 +24,11 @@ from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathere
 from mvps.joint.patches import VERTICES_OF_PATCH, Patches, drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
-from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
+from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, mean_bend, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose
-from mvps.mesh import angles_deg, mean_edge_length, normalise, vertex_normals
+from mvps.mesh import angles_deg, edges, lengths, mean_edge_length, normalise, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 
 SHARPNESS = (8.0, 32.0, 128.0)
@@ -144,6 +145,15 @@ def _choose_model(
     return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
 
 
+def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest: float) -> torch.Tensor:
+    """(V,) how far a pixel at each vertex shows one normal: 1 / (1 + s d^2), where d radians is what normals (V, 3) change by along a pixel
+    and s the sharpness of the object's sharpest lobe, which that spread of normals makes duller by this factor (Toksvig 2005)."""
+    ends = edges(surface)
+    # Neighbours within half a pixel share their samples: what they differ by is not seen.
+    length = np.maximum(lengths(surface.vertices[ends[:, 0]] - surface.vertices[ends[:, 1]]) / pixel, 0.5)
+    return 1 / (1 + sharpest * mean_bend(normal, torch.from_numpy(ends).to(normal.device), _tensor(length, normal.device)))
+
+
 def _solve_lights(
     state: State,
     capture: Capture,
@@ -153,7 +163,13 @@ def _solve_lights(
     patches: Patches,
     free_lights: bool,
 ) -> tuple[Lights, float]:
-    """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg."""
+    """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
+
+    Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
+    """
+    pixel = pixel_footprint([view.camera for view in capture.views], state.surface.vertices.mean(0))
+    single = of_one_normal(state.surface, vertices.normal, pixel, max(state.law.sharpness, default=1.0))
+    few = [replace(samples, weight=samples.weight * single[samples.vertex]) for samples in few]
     few, part, tie = subset(few, vertices, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)

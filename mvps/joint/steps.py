@@ -148,6 +148,16 @@ def confidence(vertices: Vertices) -> Tensor:
     return _confidence(vertices.sigma)
 
 
+def mean_bend(normal: Tensor, pairs: Tensor, length: Tensor) -> Tensor:
+    """(V,) mean square of what normals (V, 3) change by along the edges at a vertex, over their length; pairs (E, 2), length (E,)."""
+    change = (normal[pairs[:, 0]] - normal[pairs[:, 1]]).square().sum(1) / length**2
+    total, count = torch.zeros_like(normal[:, 0]), torch.zeros_like(normal[:, 0])
+    for end in pairs.T:
+        total.index_add_(0, end, change)
+        count.index_add_(0, end, torch.ones_like(change))
+    return total / count.clamp_min(1)
+
+
 def stated_confidence(vertices: Vertices, tie: float, pairs: Tensor) -> Tensor:
     """(V,) confidence in the normals as the surface's between the vertices: with the error of the tie (radians) to the mesh's normal that
     stands in where samples say little, and what the normal does along an edge (pairs (E, 2) of vertices), evenly spread over it:
@@ -155,12 +165,9 @@ def stated_confidence(vertices: Vertices, tie: float, pairs: Tensor) -> Tensor:
         sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + mean |n_i - n_j|^2 / 2 / 12
     """
     assert vertices.sigma is not None
-    change = (vertices.normal[pairs[:, 0]] - vertices.normal[pairs[:, 1]]).square().sum(1)
-    total, count = torch.zeros_like(vertices.scale), torch.zeros_like(vertices.scale)
-    for end in pairs.T:
-        total.index_add_(0, end, change)
-        count.index_add_(0, end, torch.ones_like(change))
-    variance = 1 / (1 / vertices.sigma.clamp_min(1e-6) ** 2 + 1 / tie**2) + total / count.clamp_min(1) / 24
+    variance = (
+        1 / (1 / vertices.sigma.clamp_min(1e-6) ** 2 + 1 / tie**2) + mean_bend(vertices.normal, pairs, torch.ones_like(pairs[:, 0])) / 24
+    )
     return torch.where(vertices.sigma.isfinite(), _confidence(variance.sqrt()), 0.0)
 
 
