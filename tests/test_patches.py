@@ -43,10 +43,16 @@ def test_patches_are_disjoint_one_sided_and_seen() -> None:
     assert few.count == 3 and len(few.vertex) == 3 * VERTICES_OF_PATCH
 
 
-def test_a_mesh_with_less_than_a_patch_is_one() -> None:
-    tetrahedron = Surface(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]), np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]))
-    patches = drawn_patches(np.arange(4), tetrahedron, vertex_normals(tetrahedron), 100, np.random.default_rng(0), CPU)
-    assert patches.count == 1 and torch.isfinite(patches.slope).all()
+@pytest.mark.parametrize(
+    "mesh", [trimesh.creation.icosphere(subdivisions=0), trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=1)]
+)
+def test_small_meshes_have_smaller_patches_with_one_side(mesh: trimesh.Trimesh) -> None:
+    surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
+    normal = vertex_normals(surface)
+    patches = drawn_patches(np.arange(len(normal)), surface, normal, 100, np.random.default_rng(0), CPU)
+    assert 0 < len(patches.vertex) <= len(normal) and torch.isfinite(patches.slope).all()
+    assert torch.allclose(patches.summed(patches.area), torch.ones(patches.count))
+    assert ((torch.tensor(normal, dtype=torch.float32)[patches.vertex] * patches.plane).sum(1) > 0).all()
 
 
 def test_relief_inside_a_patch_leaves_its_mean_slope() -> None:

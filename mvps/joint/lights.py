@@ -131,10 +131,10 @@ def _coupled(
 def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, bool]) -> Tensor:
     """dm of the Schur complement. solved: grazing, bounce."""
     H, g, hessian, gradient, cross, samples_of = parts
-    away = vertices.normal - anchor.normal
+    away, strength = vertices.normal - anchor.normal, samples_of / anchor.sigma**2
     for k, tangent in enumerate(tangents(vertices.normal)):
-        hessian[:, k, k] += samples_of / anchor.sigma**2
-        gradient[:, k] += samples_of / anchor.sigma**2 * (away * tangent).sum(1)
+        hessian[:, k, k] += strength
+        gradient[:, k] += strength * (away * tangent).sum(1)
     held = torch.zeros_like(gradient)
     held[:, 2:] = ((vertices.reflectance <= 0) & (gradient[:, 2:] >= 0)).to(held.dtype)
     free = 1 - held
@@ -190,8 +190,8 @@ def light_step(
     layout = _layout(lights, one_rig, free[0])
     parts = _coupled(views, vertices, lights, law, rotations, layout)
     step = _reduced_step(parts, vertices, anchor, patches, free[1:])
-    level = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness))).median())
-    law = _stepped_law(law, step[layout.total :], level)
+    reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness))).median())
+    law = _stepped_law(law, step[layout.total :], reflected)
     if not layout.total:
         return lights, law
     stepped = []
@@ -206,10 +206,12 @@ def light_step(
     return stepped, law
 
 
-def _stepped_law(law: Law, step: Tensor, most: float) -> Law:
+def _stepped_law(law: Law, step: Tensor, reflected: float) -> Law:
     """The law after a step, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
     grazing, bounce = (float(value) for value in torch.tensor([law.grazing, law.bounce], dtype=step.dtype) + step.cpu())
-    return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=min(max(bounce, 0.0), 1 / max(most, 1e-300)))
+    return replace(
+        law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=min(max(bounce, 0.0), 1 / max(reflected, 1e-300))
+    )
 
 
 def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:

@@ -30,7 +30,7 @@ from mvps.scene import Float, Int, Surface
 from solvers.least_squares import columns_of_inverse
 
 VERTICES_OF_PATCH = 25
-"""Five by five. With 12 lights follow the mesh's errors again; with 49 and 200 nothing more is gained, and thin parts have no patch with
+"""Five by five. Patches of 12: lights follow the mesh's errors again; of 49 and 200: nothing more is gained, and thin parts have none with
 one side (docs/method.md)."""
 
 SAME_SIDE = 0.3
@@ -79,9 +79,8 @@ def _slopes(normal: Tensor, plane: Tensor, basis: Tensor) -> tuple[Tensor, Tenso
     return slope, (basis - slope[..., None] * plane[:, None]) / height[..., None]
 
 
-def _drawn(seen: Int, surface: Surface, normal: Float, count: int, generator: np.random.Generator) -> Int:
-    """(V,) patch of each vertex, -1 outside of all."""
-    size = min(VERTICES_OF_PATCH, len(seen))
+def _drawn(seen: Int, surface: Surface, normal: Float, count: int, size: int, generator: np.random.Generator) -> Int:
+    """(V,) patch of each vertex, -1 outside of all; all -1 where the mesh has no piece of `size` vertices with one side."""
     tree = cKDTree(surface.vertices[seen])
     near = seen[tree.query(surface.vertices[seen], k=np.arange(1, min(2 * size, len(seen)) + 1))[1]]
     patch, number = np.full(len(normal), -1), 0
@@ -94,15 +93,17 @@ def _drawn(seen: Int, surface: Surface, normal: Float, count: int, generator: np
         if len(around) == size:
             patch[around] = number
             number += 1
-    if not number:
-        # A crumpled mesh has no piece with one side: its vertices are one patch.
-        patch[seen[:count]] = 0
     return patch
 
 
 def drawn_patches(seen: Int, surface: Surface, normal: Float, count: int, generator: np.random.Generator, device: torch.device) -> Patches:
     """Random disjoint patches of about `count` vertices among those seen (n,), on a mesh with normals (V, 3)."""
-    patch = _drawn(seen, surface, normal, count, generator)
+    size = min(VERTICES_OF_PATCH, len(seen))
+    patch = _drawn(seen, surface, normal, count, size, generator)
+    while (patch < 0).all():
+        # A small or crumpled mesh: its patches are smaller, at least a vertex each.
+        size = -(-size // 2)
+        patch = _drawn(seen, surface, normal, count, size, generator)
     chosen = np.flatnonzero(patch >= 0)
     vertex, of = (torch.from_numpy(a).to(device) for a in (chosen, patch[chosen]))
     n, areas = (torch.tensor(a[chosen], dtype=torch.float32, device=device) for a in (normal, vertex_areas(surface)))
