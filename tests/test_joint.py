@@ -20,7 +20,9 @@ from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights, of_one_normal
 from mvps.joint.pixels import all_pixel_normals
-from mvps.joint.steps import free_reflectance, stated_confidence, vertex_step
+from mvps.joint.reflectance import Observed
+from mvps.joint.stated import stated_confidence
+from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import Agreement, agreement, fuse
 from mvps.mesh import face_normals, isotropic_remesh, normalise, vertex_normals
@@ -187,19 +189,6 @@ def test_fusing_true_normals_and_positions_mends_a_dented_sphere() -> None:
     assert error.mean() < 0.3 * np.abs(dents).mean()
 
 
-def test_stated_confidence_knows_the_tie_and_the_meshs_own_coarseness() -> None:
-    sigma = torch.tensor([0.02, 0.02, 3.0, torch.inf])
-    flat = torch.tensor([[0.0, 0.0, 1.0]]).repeat(4, 1)
-    pairs = torch.tensor([[0, 1], [1, 2], [2, 3]])
-    vertices = Vertices(flat, torch.ones(4, 1), torch.ones(4), sigma)
-    found = 0.2 * (1 / stated_confidence(vertices, 0.3, pairs) - 1).sqrt()
-    assert torch.allclose(found[:2], torch.tensor(0.02).expand(2), rtol=0.01) and found[2] == pytest.approx(0.3, rel=0.01)
-    assert stated_confidence(vertices, 0.3, pairs)[3] == 0
-    bent = torch.nn.functional.normalize(flat + torch.tensor([[0.0], [0.4], [0.0], [0.0]]) * torch.tensor([1.0, 0, 0]), dim=1)
-    rougher = stated_confidence(replace(vertices, normal=bent), 0.3, pairs)
-    assert (rougher[:3] < stated_confidence(vertices, 0.3, pairs)[:3]).all()
-
-
 def test_pixels_of_a_fold_show_more_than_one_normal() -> None:
     """In any unit: a sphere of 20 pixels radius bends by a twentieth of a radian in a pixel. What is within half a pixel is not seen."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=20.0)
@@ -230,8 +219,8 @@ def test_steps_of_rank_deficient_problems_are_finite(scene: SphereScene, case: s
         state = vertex_step(few, state, lights[:1], law, anchor)
         assert all(torch.isfinite(t).all() for t in (state.normal, state.reflectance, state.scale)) and (state.reflectance >= 0).all()
         assert torch.allclose(state.normal.norm(dim=1), torch.tensor(1.0), atol=1e-5)
-    certain = stated_confidence(state, 0.3, torch.tensor([[0, 1]]))
-    assert torch.isfinite(certain).all() and (certain >= 0).all() and (certain <= 1).all()
+    certain = stated_confidence(Observed(scene.capture, scene.reconstruction.surface, few, state, lights[:1], law), 0.3)
+    assert (certain >= 0).all() and (certain <= 1).all()
     few, state, anchor, patches = in_patches(scene.reconstruction.surface, few, state, anchor)
     state = vertex_step(few, state, lights[:1], law, anchor, patches=patches)
     assert all(torch.isfinite(t).all() for t in (state.normal, state.reflectance, state.scale))

@@ -34,13 +34,13 @@ from mvps.joint.photometry import (
 )
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
-from mvps.joint.steps import stated_confidence
+from mvps.joint.stated import stated_confidence
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Agreement, agreement, fuse, with_masks
 from mvps.material import Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
-from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Residual, Surface
+from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 from mvps.silhouette import mask_distance
 
 NORMAL_SIGMA = 0.03
@@ -206,29 +206,25 @@ def refine(
     return replace(_finished(state, settings.final, account, device, generator), carried=carried)
 
 
-def _finished(
-    state: State, in_colour: bool, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
-) -> Refined:
-    """The result, with albedo and lobes in the photographs' colours, or grey."""
+def _finished(state: State, final: bool, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator) -> Refined:
+    """What the rounds came to; if final, with albedo and lobes in the photographs' colours, and with the stated error."""
     assert state.vertices is not None and state.under is not None
-    albedo, coloured_lobes = grey_albedo(state.vertices), False
-    tint: Float = np.ones(3)
-    residual: Residual | None = None
-    if in_colour:
+    material = material_of(state, grey_albedo(state.vertices))
+    if final:
         photographs, lights = state.under
         ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
         observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
+        coloured_lobes = False
         if state.law.sharpness:
             state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
             coloured_lobes = state.trials[-1].kept
         albedo, tint = colours(observed, ratios, coloured_lobes)
         trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
         state.trials.append(trial)
-    pairs = torch.from_numpy(edges(state.surface)).to(device)
-    stated = stated_confidence(state.vertices, WEAK_TIE, pairs).double().cpu().numpy()
-    material = replace(material_of(state, albedo), confidence=np.where(np.isfinite(albedo).all(1), stated, 0), residual=residual)
-    if coloured_lobes:
-        material = replace(material, specular_weight=material.specular_weight[..., None] * tint)
+        certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE), 0)
+        material = replace(material_of(state, albedo), confidence=certain, residual=residual)
+        if coloured_lobes:
+            material = replace(material, specular_weight=material.specular_weight[..., None] * tint)
     status, text = _verdict(account)
     return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
 

@@ -145,7 +145,7 @@ def _sigma(equations: NormalEquations, vertices: Vertices) -> Tensor:
 def confidence(vertices: Vertices) -> Tensor:
     """(V,) confidence in the normals (scene.py); 0 without samples."""
     assert vertices.sigma is not None
-    return _confidence(vertices.sigma)
+    return confidence_of(vertices.sigma)
 
 
 def mean_bend(normal: Tensor, pairs: Tensor, length: Tensor) -> Tensor:
@@ -158,19 +158,7 @@ def mean_bend(normal: Tensor, pairs: Tensor, length: Tensor) -> Tensor:
     return total / count.clamp_min(1)
 
 
-def stated_confidence(vertices: Vertices, tie: float, pairs: Tensor) -> Tensor:
-    """(V,) confidence in the normals as the surface's between the vertices: with the error of the tie (radians) to the mesh's normal that
-    stands in where samples say little, and what the normal does along an edge (pairs (E, 2) of vertices), evenly spread over it:
-
-        sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + mean |n_i - n_j|^2 / 2 / 12
-    """
-    assert vertices.sigma is not None
-    variance = (
-        1 / (1 / vertices.sigma.clamp_min(1e-6) ** 2 + 1 / tie**2) + mean_bend(vertices.normal, pairs, torch.ones_like(pairs[:, 0])) / 24
-    )
-    return torch.where(vertices.sigma.isfinite(), _confidence(variance.sqrt()), 0.0)
-
-
-def _confidence(sigma: Tensor) -> Tensor:
+def confidence_of(sigma: Tensor) -> Tensor:
+    """Confidence (scene.py) in normals with standard deviations in radians."""
     certain: Tensor = 1 / (1 + (sigma / RELIABLE) ** 2)
     return certain

@@ -1,0 +1,98 @@
+"""How far off a vertex's normal may be: the error that is stated with it.
+
+Three things are wrong with a normal. Noise is independent from sample to sample. What the model does not know (other lobes,
+inter-reflection, a position that is off) is shared by the samples of one view, or by those under one light. With H the vertex's normal
+equations, s its residuals' scale and g_c the part of the gradient that comes from view or light c, the errors of the unknowns have the
+covariance
+
+    H^-1 (s^2 H + sum_views g_c g_c^T + sum_lights g_c g_c^T) H^-1
+
+(sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011). Last, no surface has the
+normals n of all vertices: fused positions keep only what is integrable of them, and of an error without any pattern half is. So how far n
+is from the normal m of the surface is one more sign of error. Of each tangential component
+
+    sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2
+
+where the tie to the mesh stands in where samples say little. A vertex has few clusters, so its figures are averaged with its neighbours'.
+No constant is fitted to true normals.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvps.cores import on_cores
+from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, evaluate, robust, tangents, vertex_derivatives
+from mvps.joint.observe import ViewSamples
+from mvps.joint.reflectance import Observed
+from mvps.joint.steps import confidence_of
+from mvps.mesh import edges, normalise, vertex_normals
+from mvps.scene import Float, Law, Surface
+from solvers.least_squares import columns_of_inverse
+
+ROUNDS = 2
+"""Of averaging with neighbours, over some twenty vertices: a variance from a handful of clusters is known to a factor of two at best."""
+
+
+def icosahedron() -> Float:
+    """(12, 3) unit vectors to its corners."""
+    golden = (1 + 5**0.5) / 2
+    corners = np.array([np.roll((0.0, s, t), k) for s in (1, -1) for t in (golden, -golden) for k in range(3)])
+    return normalise(corners)
+
+
+def stated_confidence(of: Observed, tie: float) -> Float:
+    """(V,) confidence (scene.py) in the vertices' normals as those of the surface; 0 without samples. tie: radians."""
+    hands = min(WORKERS, len(of.views))
+    parts = on_cores(lambda k: _sums(of.views[k::hands], of.vertices, of.lights[k::hands], of.law), range(hands))
+    hessian, meat, of_kinds, squares, count = (sum(of_hands[1:], of_hands[0]) for of_hands in zip(*parts, strict=True))
+    scale = squares / count.clamp_min(torch.finfo(squares.dtype).tiny)
+    meat = meat + of_kinds.transpose(1, 2) @ of_kinds + scale[:, None, None] * hessian
+    bread = columns_of_inverse(hessian, 2)
+    variance = (bread * (meat @ bread)).sum((1, 2)) / 2
+    seen = (count > 0) & (variance > 0)
+    # A camera sees no two normals that are further apart than a radian or so.
+    variance = torch.where(seen, variance.clamp(1e-12, 1.0), 0.0)
+    away = of.vertices.normal - torch.tensor(vertex_normals(of.surface)).to(of.vertices.normal)
+    variance, apart = _averaged(torch.stack([variance, away.square().sum(1) / 2], 1), seen, of.surface).unbind(1)
+    return torch.where(seen, confidence_of((1 / (1 / variance + 1 / tie**2) + apart).sqrt()), 0.0).double().cpu().numpy()
+
+
+def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> tuple[Tensor, ...]:
+    """H (V, p, p), sum over views of g g^T (V, p, p), g under each kind of light (V, 12, p), weighted squares and weights (V,)."""
+    like, n, p = vertices.normal, len(vertices.normal), 2 + vertices.reflectance.shape[1]
+    corners = torch.from_numpy(icosahedron()).to(like)
+    hessian, meat, of_kinds = like.new_zeros(n, p, p), like.new_zeros(n, p, p), like.new_zeros(n, len(corners), p)
+    squares, count = like.new_zeros(n), like.new_zeros(n)
+    first, second = tangents(vertices.normal)
+    for samples, of_view in zip(views, lights, strict=True):
+        kind = torch.nn.functional.one_hot((of_view.direction @ corners.T).argmax(1), len(corners)).to(like)
+        for part in samples.chunks():
+            index, towards = samples.vertex[part], samples.towards[part]
+            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
+            residual = shaded.predicted - samples.image[part]
+            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
+            rows = torch.stack(vertex_derivatives(shaded, (first[index], second[index]), towards, of_view), 1)
+            by_kind = ((rows * (weight * residual)[:, None]) @ kind).transpose(1, 2)
+            by_view = by_kind.sum(1)
+            hessian.index_add_(0, index, (rows * weight[:, None]) @ rows.transpose(1, 2))
+            meat.index_add_(0, index, by_view[:, :, None] * by_view[:, None])
+            of_kinds.index_add_(0, index, by_kind)
+            squares.index_add_(0, index, (weight * residual**2).sum(1))
+            count.index_add_(0, index, weight.sum(1))
+    return hessian, meat, of_kinds, squares, count
+
+
+def _averaged(values: Tensor, known: Tensor, surface: Surface) -> Tensor:
+    """(V, k) values, where known, averaged with their neighbours'."""
+    ends = torch.from_numpy(edges(surface)).to(known.device)
+    share = known.to(values)[:, None]
+    for _ in range(ROUNDS):
+        total = torch.cat([values, torch.ones_like(share)], 1) * share
+        around = total.clone()
+        for here, there in ((0, 1), (1, 0)):
+            around.index_add_(0, ends[:, here], total[ends[:, there]])
+        values = around[:, :-1] / around[:, -1:].clamp_min(1)
+    return values
