@@ -15,6 +15,7 @@ from references import in_patches
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.joint import vertices
+from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, observe
@@ -24,7 +25,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
-from mvps.joint.vertices import Agreement, agreement, fuse
+from mvps.joint.vertices import fuse
 from mvps.mesh import face_normals, isotropic_remesh, normalise, vertex_normals
 from mvps.scene import Capture, Law, Lights, Material, Surface
 

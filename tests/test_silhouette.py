@@ -6,8 +6,9 @@ import numpy as np
 from sphere_scene import RADIUS, camera_at, make_sphere
 
 from mvps.camera import project, rays
+from mvps.joint.agreement import Agreement
 from mvps.joint.refine import POSITION_FLOOR_PIXELS
-from mvps.joint.vertices import Agreement, with_masks
+from mvps.joint.vertices import with_masks
 from mvps.mesh import normalise, unbiased
 from mvps.scene import Camera, Surface
 from mvps.silhouette import mask_distance, outline, sampled

@@ -12,7 +12,9 @@ reflectance.py  colours of the lights
 colours.py      colours of body and lobes
 photometry.py   the photometric part of a round
 fused.py        the views' normals together, on vertices and faces
-vertices.py     positions from normals and from the agreement of views
+agreement.py    where views agree that the surface is
+vertices.py     positions from normals, agreement and masks
+stated.py       the error that is stated with the normals
 refine.py       the rounds
 held_out.py     lights of photographs that were kept back
 """

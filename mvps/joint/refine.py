@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from mvps.camera import pixel_footprint
+from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
 from mvps.joint.fused import face_targets
@@ -36,7 +37,7 @@ from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.unseen import closed_over
-from mvps.joint.vertices import Agreement, agreement, fuse, with_masks
+from mvps.joint.vertices import fuse, with_masks
 from mvps.material import Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
