@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from mvps.memory import keep_freed
 from mvps.progress import ConsoleHandler
 from mvps.scene import CaptureError
 
@@ -52,6 +53,7 @@ def parse(made: Parser, argv: Sequence[str]) -> argparse.Namespace:
 
 def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:
     """Run a command with these arguments (None: those of the process) and return its exit code."""
+    keep_freed()
     try:
         main(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()

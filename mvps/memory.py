@@ -10,6 +10,7 @@ for more, so every mesh is looked at again. Sizes are in bytes, measured as the 
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 
 from mvps.cores import at_a_time, work_on
@@ -33,7 +34,25 @@ IN_WORK = 25.0
 DENSITY = {"draft": 0.35, "standard": 1.25, "fine": 2.8}
 """Vertices over the area in pixels. In `standard` 0.8 to 1.2 on two captures, and 3.5 on one that is creased all over."""
 
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
+"""Numbers of glibc's options (malloc.h)."""
+
+LARGEST_KEPT = 32 << 20
+"""Bytes of the largest piece that glibc itself would come to keep (mallopt(3): DEFAULT_MMAP_THRESHOLD_MAX)."""
+
 _limit: list[tuple[float, float, Sequence[tuple[int, int]]]] = []
+
+
+def keep_freed() -> None:
+    """From now on the C library keeps what is freed for the next array, in one pool for all threads; to be called before there are any.
+
+    Left to itself glibc returns it to the system, which then clears its pages once more and has threads wait for each other meanwhile, and
+    holds a pool for every thread. Other C libraries have no such options.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        for option, value in ((M_ARENA_MAX, 1), (M_MMAP_THRESHOLD, LARGEST_KEPT), (M_TRIM_THRESHOLD, 2**31 - 1)):
+            mallopt(option, value)
 
 
 def peak_bytes(program: float, sizes: Sequence[tuple[int, int]], vertices: float, views: int) -> float:

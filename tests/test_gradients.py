@@ -46,7 +46,7 @@ def test_derivatives_against_finite_differences(situation: str) -> None:
     lights = DirectionalLights(light, intensity)
     shaded = evaluate(normal, reflectance, view, lights, law, gathered)
     by_vertex = torch.stack(vertex_derivatives(shaded, frame, view, lights), 1)[0, :, 0]
-    by_light = light_jacobian(shaded, normal, view, lights, law, torch.eye(3, dtype=torch.float64))[0, 0]
+    by_light = light_jacobian(shaded, normal, view, lights, law, torch.eye(3, dtype=torch.float64))[0, :, 0]
     zero = torch.zeros(2, dtype=torch.float64)
     numeric = torch.autograd.functional.jacobian(image, (zero, reflectance, light * intensity))
     assert torch.allclose(by_vertex, torch.cat([numeric[0], numeric[1][0]]), atol=1e-10)

@@ -107,3 +107,28 @@ def test_a_limit_is_obeyed_and_changes_no_value(capture: Path, tmp_path: Path) -
         assert float(done.stdout.splitlines()[-1]) < 1000 * limit
     for file in ("mesh.ply", "material.npz", "lights.json"):
         assert (tmp_path / "tight" / file).read_bytes() == (tmp_path / "free" / file).read_bytes()
+
+
+@pytest.mark.skipif(not os.confstr("CS_GNU_LIBC_VERSION"), reason="an option of glibc")
+def test_freed_memory_serves_the_next_array() -> None:
+    """Pages that the system hands out anew (minor faults) while two threads make and drop arrays of 1 MB."""
+    program = """
+import resource, sys
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from mvps.memory import keep_freed
+if sys.argv[1:]:
+    keep_freed()
+def work(_):
+    for _ in range(50):
+        arrays = [np.ones(1 << 17) for _ in range(3)]
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(work, range(2)))
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults()
+print(faults())
+"""
+    without, kept = (int(subprocess.check_output([sys.executable, "-c", program, *options])) for options in ([], ["keep"]))
+    assert kept < 1000 < without

@@ -13,17 +13,19 @@ with D_x = 1 + g (1 - n.x)^p (shading.py) and b e G the light that other surface
     dI/dg = q a ((1 - n.l)^p D_v + (1 - n.v)^p D_l),   dI/db = a e G
 
 Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale per vertex, the standard deviation of its weighted residuals.
-Every block is Gauss-Newton: normal equations are accumulated over chunks of pairs, never a Jacobian as a whole, and add up over views.
-Chunks are single-threaded and views are dealt to threads: torch's own threads would meet at a barrier after every one of some thirty
+Every block is Gauss-Newton: normal equations are accumulated over batches of pairs, never a Jacobian as a whole, and add up over views.
+Batches are single-threaded and views are dealt to threads: torch's own threads would meet at a barrier after every one of some thirty
 small operations.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from mvps.cores import on_cores
 from mvps.joint.observe import ViewSamples
@@ -83,9 +85,73 @@ class DirectionalLights:
         return DirectionalLights(self.direction[rows], self.intensity[rows])
 
 
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Samples of k views with equally many lights that are handled at once: n pairs of each, fewer filled up with pairs of no weight.
+
+    views: their numbers; vertex (k, n); towards (k, n, 3); weight (k, n, lights) of the samples, 0 where they are no data; image
+    (k, n, lights); gathered (k, n, lights) or None; lights: direction (k, lights, 3), intensity (k, 1, lights).
+    """
+
+    views: list[int]
+    vertex: Tensor
+    towards: Tensor
+    weight: Tensor
+    image: Tensor
+    gathered: Tensor | None
+    lights: DirectionalLights
+
+    def added(self, sums: Tensor, values: Tensor) -> None:
+        """Adds values (k, n, ...) of the pairs to sums (V, ...) of their vertices, in place."""
+        sums.index_add_(0, self.vertex.flatten(), values.flatten(0, 1))
+
+
+def _together(views: list[ViewSamples]) -> Iterator[list[tuple[int, slice]]]:
+    """Which views, and which of their pairs, make a batch: part of a view, or all pairs of consecutive small ones."""
+    group: list[tuple[int, slice]] = []
+    longest = 0
+    for i, samples in enumerate(views):
+        pairs = len(samples.vertex)
+        if pairs > samples.pairs_at_once:
+            yield from ([(i, part)] for part in samples.chunks())
+            continue
+        longest = max(longest, pairs)
+        alike = all(views[j].image.shape[1] == samples.image.shape[1] for j, _ in group)
+        if group and not (alike and (len(group) + 1) * longest <= samples.pairs_at_once):
+            yield group
+            group, longest = [], pairs
+        if pairs:
+            group.append((i, slice(None)))
+    if group:
+        yield group
+
+
+def batches(views: list[ViewSamples], lights: list[DirectionalLights]) -> Iterator[Batch]:
+    """All samples of the views, in a fixed order. Small views go together: alone each takes some thirty
+    operations, whose start then takes longer than they do."""
+    for group in _together(views):
+        some = [views[i] for i, _ in group]
+
+        def filled(values: list[Tensor], group: list[tuple[int, slice]] = group) -> Tensor:
+            parts = [of_view[part] for of_view, (_, part) in zip(values, group, strict=True)]
+            return parts[0][None] if len(parts) == 1 else pad_sequence(parts, batch_first=True)
+
+        gathered = [s.gathered for s in some if s.gathered is not None]
+        direction, intensity = (torch.stack([getattr(lights[i], name) for i, _ in group]) for name in ("direction", "intensity"))
+        yield Batch(
+            [i for i, _ in group],
+            filled([s.vertex for s in some]),
+            filled([s.towards for s in some]),
+            filled([s.weight for s in some])[..., None] * filled([s.data for s in some]),
+            filled([s.image for s in some]),
+            filled(gathered) if gathered else None,
+            DirectionalLights(direction, intensity[:, None]),
+        )
+
+
 @dataclass(frozen=True)
 class Shaded:
-    """The image model on a chunk of pairs, (n, lights) each: lit 1 above the horizon; n . l clamped at 0; h . n; c; basis dI/da and
+    """The image model on a batch of pairs, (..., n, lights) each: lit 1 above the horizon; n . l clamped at 0; h . n; c; basis dI/da and
     q E_k; reflectance R; slope B; of_light a D_l' D_v, of_view a D_l D_v'; grazing dI/dg; indirect a e G; predicted I."""
 
     lit: Tensor
@@ -105,17 +171,18 @@ class Shaded:
 def evaluate(
     normal: Tensor, reflectance: Tensor, towards: Tensor, lights: DirectionalLights, law: Law, gathered: Tensor | None = None
 ) -> Shaded:
-    """The image model for normal, towards (n, 3) and reflectance (n, 1 + lobes) under all lights of a view. gathered (n, lights): G."""
+    """The image model for normal, towards (..., n, 3) and reflectance (..., n, 1 + lobes) under all lights of a view, or of several that
+    stand first (Batch). gathered (..., n, lights): G."""
     light, intensity = lights.direction, lights.intensity
-    n_dot_l = normal @ light.T
-    v_dot_l = towards @ light.T
+    n_dot_l = normal @ light.mT
+    v_dot_l = towards @ light.mT
     n_dot_v = (normal * towards).sum(-1, keepdim=True)
     half = half_dot_normal(n_dot_v, n_dot_l, v_dot_l)
     c = (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
     lit = (n_dot_l > 0).to(normal.dtype)
     n_dot_l = n_dot_l.clamp_min(0)
     q = n_dot_l * intensity
-    albedo = reflectance[:, :1]
+    albedo = reflectance[..., :1]
     (of_l, slope_l), (of_v, slope_v) = _grazing(n_dot_l), _grazing(n_dot_v.clamp_min(0))
     D_l, D_v = 1 + law.grazing * of_l, 1 + law.grazing * of_v
     total = albedo * D_l * D_v
@@ -125,7 +192,7 @@ def evaluate(
     basis = [q * (D_l * D_v) + (0 if gathered is None else law.bounce * intensity * gathered)]
     for k, s in enumerate(law.sharpness):
         lobe = torch.exp(s * (half - 1))
-        weighted = lobe * reflectance[:, k + 1, None]
+        weighted = lobe * reflectance[..., k + 1, None]
         total = total + weighted
         slope = slope + s * weighted
         basis.append(q * lobe)
@@ -142,34 +209,31 @@ def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def vertex_derivatives(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> list[Tensor]:
-    """3 + lobes derivatives (n, lights) of the samples by two tangential steps of the normal, the albedo and the weights."""
+    """3 + lobes derivatives (..., n, lights) of the samples by two tangential steps of the normal, the albedo and the weights."""
     along_light = shaded.lit * lights.intensity * shaded.reflectance
     q = shaded.n_dot_l * lights.intensity
     along_half = q * shaded.slope / shaded.c
     along_light = along_light + along_half + q * shaded.of_light
     along_view = along_half + q * shaded.of_view
-    columns = [along_light * (t @ lights.direction.T) + along_view * (t * towards).sum(-1, keepdim=True) for t in frame]
+    columns = [along_light * (t @ lights.direction.mT) + along_view * (t * towards).sum(-1, keepdim=True) for t in frame]
     return columns + shaded.basis
 
 
 def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: DirectionalLights, law: Law, rotation: Tensor) -> Tensor:
-    """(n, lights, 3) derivatives of the samples by m = intensity * direction in the camera's frame (rotation: camera_from_world)."""
+    """(..., n, 3, lights) derivatives of the samples by m = intensity * direction in the camera's frame (rotation: camera_from_world)."""
     along_normal = shaded.n_dot_l * (shaded.slope / shaded.c + shaded.of_light)
     # dI/dm = alpha n + beta v + gamma l
     alpha = shaded.lit * shaded.reflectance + along_normal
     beta = -shaded.n_dot_l * shaded.slope / shaded.c * shaded.half / shaded.c
     v_dot_l = shaded.c**2 / 2 - 1
     gamma = law.bounce * shaded.indirect / lights.intensity - (along_normal * shaded.n_dot_l + beta * v_dot_l)
-    return (
-        alpha[..., None] * (normal @ rotation.T)[:, None]
-        + beta[..., None] * (towards @ rotation.T)[:, None]
-        + gamma[..., None] * (lights.direction @ rotation.T)[None]
-    )
+    n, v, light = (a @ rotation.mT for a in (normal, towards, lights.direction))
+    return alpha[..., None, :] * n[..., None] + beta[..., None, :] * v[..., None] + gamma[..., None, :] * light.mT[..., None, :, :]
 
 
 def robust(residual: Tensor, scale: Tensor) -> Tensor:
-    """Cauchy's weight of residuals (n, lights) with scale (n,)."""
-    return 1 / (1 + (residual / (CAUCHY_95 * scale[:, None])) ** 2)
+    """Cauchy's weight of residuals (..., n, lights) with scale (..., n)."""
+    return 1 / (1 + (residual / (CAUCHY_95 * scale[..., None])) ** 2)
 
 
 def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
@@ -177,15 +241,14 @@ def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list
     # One product of (jacobian, residual) with itself holds hessian, gradient and squares.
     sums, count = vertices.normal.new_zeros(n, p + 1, p + 1), vertices.normal.new_zeros(n)
     first, second = tangents(vertices.normal)
-    for samples, of_view in zip(views, lights, strict=True):
-        for part in samples.chunks():
-            index, towards = samples.vertex[part], samples.towards[part]
-            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
-            residual = shaded.predicted - samples.image[part]
-            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
-            rows = torch.stack([*vertex_derivatives(shaded, (first[index], second[index]), towards, of_view), residual], 1)
-            sums.index_add_(0, index, (rows * weight[:, None]) @ rows.transpose(1, 2))
-            count.index_add_(0, index, weight.sum(1))
+    for batch in batches(views, lights):
+        index, towards = batch.vertex, batch.towards
+        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
+        residual = shaded.predicted - batch.image
+        weight = batch.weight * robust(residual, vertices.scale[index])
+        rows = torch.stack([*vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights), residual], -2)
+        batch.added(sums, (rows * weight[..., None, :]) @ rows.mT)
+        batch.added(count, weight.sum(-1))
     return NormalEquations(sums[:, :p, :p].contiguous(), sums[:, :p, p].contiguous(), sums[:, p, p].contiguous(), count)
 
 

@@ -62,8 +62,8 @@ def _step(
             residual = shaded.predicted - samples.image[part]
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
             J = light_jacobian(shaded, vertices.normal[index], towards, of_view, law, rotation)
-            H += torch.einsum("pl,pli,plj->lij", weight, J, J)
-            g += torch.einsum("pl,pli,pl->li", weight, J, residual)
+            H += torch.einsum("pl,pil,pjl->lij", weight, J, J)
+            g += torch.einsum("pl,pil,pl->li", weight, J, residual)
         sums.append((H, g))
     if one_rig:
         sums = [(torch.stack([H for H, _ in sums]).sum(0), torch.stack([g for _, g in sums]).sum(0))] * len(sums)

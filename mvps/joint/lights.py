@@ -24,7 +24,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust, tangents, vertex_derivatives
+from mvps.cores import on_cores
+from mvps.joint.blocks import (
+    WORKERS,
+    DirectionalLights,
+    Vertices,
+    batches,
+    evaluate,
+    light_jacobian,
+    robust,
+    tangents,
+    vertex_derivatives,
+)
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
 from mvps.joint.steps import LARGEST_TURN, Anchor
@@ -60,78 +71,117 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the lights of each view stand among the unknowns: one place for all views of a rig, else one after the other; total 0
-    where the lights are known."""
+    """Which lights are whose: of each view the number of its rig, one for all or one for each; of each rig the number of its lights, none
+    where they are known. The unknowns are the rigs' m, x of all lights, then y, then z, and those of the law."""
 
-    start: list[int]
-    total: int
+    rig: list[int]
+    lights: list[int]
+
+    def start(self, rig: int) -> int:
+        """Place of a rig's first unknown."""
+        return 3 * sum(self.lights[:rig])
 
 
 def _layout(lights: list[DirectionalLights], one_rig: bool, free: bool) -> _Layout:
-    if not free:
-        return _Layout([0] * len(lights), 0)
-    sizes = [len(of_view.intensity) for of_view in lights]
-    if one_rig:
-        return _Layout([0] * len(sizes), 3 * sizes[0])
-    starts = [3 * sum(sizes[:i]) for i in range(len(sizes))]
-    return _Layout(starts, 3 * sum(sizes))
+    sizes = [len(of_view.intensity) for of_view in lights] if free else []
+    return _Layout([0] * len(lights), sizes[:1]) if one_rig else _Layout(list(range(len(lights))), sizes)
+
+
+@dataclass(frozen=True)
+class _Sums:
+    """Products of derivatives with each other, each sample divided by its vertex's residual variance.
+
+    vertices (V, p + 3, p + 3): by the vertex's p unknowns and the law's two, and the residual; count (V,) weight of a vertex's samples;
+    of each rig cross (V, p, 3, lights): by vertex and light; lights (lights, 3, 6): by light with by light, the law's two, the residual.
+    """
+
+    vertices: Tensor
+    count: Tensor
+    cross: dict[int, Tensor]
+    lights: dict[int, Tensor]
+
+    def add(self, other: _Sums) -> None:
+        """Adds sums over other views, in place."""
+        self.vertices.add_(other.vertices)
+        self.count.add_(other.count)
+        for mine, others in ((self.cross, other.cross), (self.lights, other.lights)):
+            for rig, values in others.items():
+                mine[rig] = mine[rig].add_(values) if rig in mine else values
+
+
+def _sums(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: Tensor, rigs: list[int]
+) -> _Sums:
+    """Over some views with their lights, rotations (views, 3, 3) and rigs, -1 where the lights are known."""
+    n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
+    size = {rig: len(of_view.intensity) for rig, of_view in zip(rigs, lights, strict=True) if rig >= 0}
+    sums = _Sums(
+        like.new_zeros(n, p + 3, p + 3),
+        like.new_zeros(n),
+        {rig: like.new_zeros(n, p, 3, count) for rig, count in size.items()},
+        {rig: like.new_zeros(count, 3, 6, dtype=torch.float64) for rig, count in size.items()},
+    )
+    first, second = tangents(vertices.normal)
+    for batch in batches(views, lights):
+        index, towards = batch.vertex, batch.towards
+        normal, scale = vertices.normal[index], vertices.scale[index]
+        shaded = evaluate(normal, vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
+        residual = shaded.predicted - batch.image
+        weight = batch.weight * robust(residual, scale)
+        batch.added(sums.count, weight.sum(-1))
+        of_vertex = vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights)
+        rows = torch.stack([*of_vertex, shaded.grazing, shaded.indirect, residual], -2)
+        weighted = rows * (weight / scale[..., None] ** 2)[..., None, :]
+        batch.added(sums.vertices, weighted @ rows.mT)
+        if not size:
+            continue
+        of_light = light_jacobian(shaded, normal, towards, batch.lights, law, rotations[batch.views])
+        for k, view in enumerate(batch.views):
+            rig = rigs[view]
+            sums.cross[rig].index_add_(0, index[k], weighted[k, :, :p, None] * of_light[k, :, None])
+            # What goes with the light's own derivative carries the weight.
+            heavy = (weight[k] / scale[k, :, None] ** 2)[:, None] * of_light[k]
+            sums.lights[rig] += torch.einsum("pil,pjl->lij", of_light[k], torch.cat([heavy, weighted[k, :, p:]], 1))
+    return sums
 
 
 def _coupled(
-    views: list[ViewSamples],
-    vertices: Vertices,
-    lights: list[DirectionalLights],
-    law: Law,
-    rotations: list[Tensor],
-    layout: _Layout,
-) -> tuple[Tensor, ...]:
-    """H_mm, g_m, H_jj, g_j, H_jm, each sample divided by its vertex's residual variance, and the weight of a vertex's samples (V,).
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: list[Tensor], layout: _Layout
+) -> _Sums:
+    """The sums over all views, dealt to the cores as `vertex_equations` deals them."""
+    hands, every = min(WORKERS, len(views)), torch.stack(rotations)
+    rigs = layout.rig if layout.lights else [-1] * len(views)
 
-    The last two of m are the law's grazing and bounce.
-    """
-    n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
-    unknowns = layout.total + OF_LAW
-    lights_hessian = like.new_zeros(unknowns, unknowns, dtype=torch.float64)
-    lights_gradient = like.new_zeros(unknowns, dtype=torch.float64)
-    hessian, gradient = like.new_zeros(n, p, p), like.new_zeros(n, p)
-    cross, samples_of = like.new_zeros(n, p, unknowns), like.new_zeros(n)
-    frame = tangents(vertices.normal)
-    for samples, of_view, rotation, start in zip(views, lights, rotations, layout.start, strict=True):
-        width = 3 * len(of_view.intensity) if layout.total else 0
-        of_lights = slice(start, start + width)
-        for part in samples.chunks():
-            index, towards = samples.vertex[part], samples.towards[part]
-            normal = vertices.normal[index]
-            shaded = evaluate(normal, vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
-            residual = shaded.predicted - samples.image[part]
-            scale = vertices.scale[index]
-            weight = samples.weight[part, None] * samples.data[part] * robust(residual, scale) / scale[:, None] ** 2
-            of_vertex = torch.stack(vertex_derivatives(shaded, (frame[0][index], frame[1][index]), towards, of_view), 1)
-            of_law = torch.stack([shaded.grazing, shaded.indirect], -1)
-            weighted = of_vertex * weight[:, None]
-            hessian.index_add_(0, index, weighted @ of_vertex.transpose(1, 2))
-            gradient.index_add_(0, index, (weighted @ residual[..., None])[..., 0])
-            samples_of.index_add_(0, index, (weight * scale[:, None] ** 2).sum(1))
-            cross[:, :, layout.total :].index_add_(0, index, weighted @ of_law)
-            if width:
-                of_light = light_jacobian(shaded, normal, towards, of_view, law, rotation)
-                coupling = (weighted[..., None] * of_light[:, None]).reshape(len(index), p, width)
-                cross[:, :, of_lights].index_add_(0, index, coupling)
-                heavy = of_light * weight[..., None]
-                lights_hessian[of_lights, of_lights] += torch.block_diag(*torch.einsum("pli,plj->lij", heavy, of_light).double())
-                lights_gradient[of_lights] += torch.einsum("pli,pl->li", heavy, residual).reshape(-1).double()
-                shared = torch.einsum("pli,plk->lik", heavy, of_law).reshape(width, OF_LAW).double()
-                lights_hessian[of_lights, layout.total :] += shared
-                lights_hessian[layout.total :, of_lights] += shared.T
-            lights_hessian[layout.total :, layout.total :] += torch.einsum("pl,pli,plj->ij", weight, of_law, of_law).double()
-            lights_gradient[layout.total :] += torch.einsum("pl,pli,pl->i", weight, of_law, residual).double()
-    return lights_hessian, lights_gradient, hessian, gradient, cross, samples_of
+    def dealt(k: int) -> _Sums:
+        return _sums(views[k::hands], vertices, lights[k::hands], law, every[k::hands], rigs[k::hands])
+
+    total, *others = on_cores(dealt, range(hands))
+    for other in others:
+        total.add(other)
+    return total
 
 
-def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, bool]) -> Tensor:
+def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
+    """H_mm and g_m; the last two of m are the law's grazing and bounce."""
+    of_law = sums.vertices[:, -3:, -3:].double().sum(0)
+    unknowns = 3 * sum(layout.lights) + OF_LAW
+    H, g = of_law.new_zeros(unknowns, unknowns), of_law.new_zeros(unknowns)
+    H[-2:, -2:], g[-2:] = of_law[:2, :2], of_law[:2, 2]
+    for rig, count in enumerate(layout.lights):
+        products, start = sums.lights[rig].permute(1, 2, 0), layout.start(rig)
+        own = slice(start, start + 3 * count)
+        torch.diagonal(H[own, own].view(3, count, 3, count), dim1=1, dim2=3).copy_(products[:, :3])
+        H[own, -2:] = products[:, 3:5].transpose(1, 2).reshape(-1, 2)
+        H[-2:, own] = H[own, -2:].T
+        g[own] = products[:, 5].reshape(-1)
+    return H, g
+
+
+def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, bool]) -> Tensor:
     """dm of the Schur complement. solved: grazing, bounce."""
-    H, g, hessian, gradient, cross, samples_of = parts
-    away, strength = vertices.normal - anchor.normal, samples_of / anchor.sigma**2
+    H, g = _lights_equations(sums, layout)
+    hessian, gradient = sums.vertices[:, :-3, :-3].clone(), sums.vertices[:, :-3, -1].clone()
+    away, strength = vertices.normal - anchor.normal, sums.count / anchor.sigma**2
     for k, tangent in enumerate(tangents(vertices.normal)):
         hessian[:, k, k] += strength
         gradient[:, k] += strength * (away * tangent).sum(1)
@@ -145,7 +195,8 @@ def _reduced_step(parts: tuple[Tensor, ...], vertices: Vertices, anchor: Anchor,
     for start in range(0, len(hessian), VERTICES_PER_BLOCK):
         part = slice(start, start + VERTICES_PER_BLOCK)
         L = torch.linalg.cholesky(hessian[part].double())
-        coupled = (cross[part] * free[part][..., None]).double()
+        cross = [*(sums.cross[rig][part].flatten(2) for rig in range(len(layout.lights))), sums.vertices[part, :-3, -3:-1]]
+        coupled = (torch.cat(cross, 2) * free[part][..., None]).double()
         half = torch.linalg.solve_triangular(L, coupled, upper=False)
         right = torch.linalg.solve_triangular(L, (gradient[part] * free[part]).double()[..., None], upper=False)
         # L^-1 of the normals' columns: products of two such halves have the inverse of the whole block between them.
@@ -188,16 +239,15 @@ def light_step(
     rotations: camera_from_world of the views, float32.
     """
     layout = _layout(lights, one_rig, free[0])
-    parts = _coupled(views, vertices, lights, law, rotations, layout)
-    step = _reduced_step(parts, vertices, anchor, patches, free[1:])
+    step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free[1:])
     reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness))).median())
-    law = _stepped_law(law, step[layout.total :], reflected)
-    if not layout.total:
+    law = _stepped_law(law, step[-OF_LAW:], reflected)
+    if not layout.lights:
         return lights, law
     stepped = []
-    for of_view, rotation, start in zip(lights, rotations, layout.start, strict=True):
+    for of_view, rotation, rig in zip(lights, rotations, layout.rig, strict=True):
         m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T
-        d = step[start : start + m.numel()].reshape(-1, 3)
+        d = step[layout.start(rig) :][: m.numel()].reshape(3, -1).T
         length = m.norm(dim=1, keepdim=True)
         d = d * (LARGEST_TURN * length / d.norm(dim=1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
         m = m + d

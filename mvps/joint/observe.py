@@ -70,10 +70,15 @@ class ViewSamples:
         assert image is not None and data is not None
         return ViewSamples(self.vertex, self.towards, self.weight, image, data, gathered)
 
-    def chunks(self) -> Iterator[slice]:
-        """Slices of the pairs that hold about as many samples as are handled at once."""
+    @property
+    def pairs_at_once(self) -> int:
+        """Pairs that hold about as many samples as are handled at once."""
         samples = SAMPLES_PER_CHUNK if self.image.device.type == "cpu" else SAMPLES_PER_LAUNCH
-        step = max(1, samples // max(1, self.image.shape[1]))
+        return max(1, samples // max(1, self.image.shape[1]))
+
+    def chunks(self) -> Iterator[slice]:
+        """Slices of the pairs that are handled at once."""
+        step = self.pairs_at_once
         return (slice(start, start + step) for start in range(0, len(self.vertex), step))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
+from mvps.joint.blocks import DirectionalLights, Vertices, batches, evaluate
 from mvps.joint.lights import light_step
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
@@ -60,12 +60,10 @@ def held_out_errors(
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
     error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)
-    for samples, of_view in zip(kept, lights, strict=True):
-        for part in samples.chunks():
-            index = samples.vertex[part]
-            shaded = evaluate(state.normal[index], state.reflectance[index], samples.towards[part], of_view, law, samples.gathered_of(part))
-            weight = samples.weight[part, None] * samples.data[part]
-            error.index_add_(0, index, (weight * (shaded.predicted - samples.image[part]).abs()).sum(1))
-            level.index_add_(0, index, (weight * samples.image[part]).sum(1))
+    for batch in batches(kept, lights):
+        index = batch.vertex
+        shaded = evaluate(state.normal[index], state.reflectance[index], batch.towards, batch.lights, law, batch.gathered)
+        batch.added(error, (batch.weight * (shaded.predicted - batch.image).abs()).sum(-1))
+        batch.added(level, (batch.weight * batch.image).sum(-1))
     ratio = (error / level).double().cpu().numpy()
     return np.where(level.cpu().numpy() > 0, ratio, np.nan)
