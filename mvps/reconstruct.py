@@ -33,6 +33,9 @@ TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
 
+HULL_CELL = {"draft": 3.0, "standard": 2.0, "fine": 2.0}
+"""Pixels along a cell of the hull: two are what masks can tell, and Stage I starts from them; three are the edges of the first mesh."""
+
 GOOD_HULL = 0.2
 """Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
 captures, docs/method.md), so it would do no better."""
@@ -66,14 +69,14 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     from mvps.joint.refine import RefineSettings, RoundSettings
 
     rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.0 if final else 3.0, 2.0, 0.4))
-    return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final)
+    return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True)
 
 
 def between_passes(free_lights: bool) -> RefineSettings:
     """A round on Stage I's surface, for the normals and lights from which Stage I is trained again."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights, for_field=True)
+    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights, for_field=True, half=True)
 
 
 def last_pass(preset: str, free_lights: bool) -> RefineSettings:
@@ -111,12 +114,12 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     return used, capture.select(rest) if rest else None
 
 
-def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
+def rough_shape(capture: Capture, preset: str, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
     from mvps.hull import default_cells, signed_distance, visual_hull
 
     with progress.stage("visual hull") as stage:
-        grid = signed_distance(capture, default_cells(capture))
+        grid = signed_distance(capture, default_cells(capture, HULL_CELL[preset]))
         surface = visual_hull(grid)
         stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing:.3g} units")
     return grid, surface
@@ -236,12 +239,13 @@ def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: R
 def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[Any, ...]:
     """Refined normals (height, width, 3) of every view, NaN outside the mask.
 
-    Views that were used show their own pixels' normals; held-out ones the vertices' normals. A pixel that misses the mesh takes its
-    nearest neighbour's.
+    Views that were used show their own pixels' normals, as far as they were solved (`filled`); held-out ones the vertices' normals. A pixel
+    that misses the mesh takes its nearest neighbour's.
     """
     import numpy as np
     from scipy.ndimage import distance_transform_edt
 
+    from mvps.joint.pixels import filled
     from mvps.rendering import points_under
     from mvps.visibility import ray_caster
 
@@ -250,7 +254,7 @@ def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[
     pictures = []
     for view in capture.views:
         points = points_under(caster, refined.material, view.camera, view.pixels)
-        normal = own[view.name].normal if view.name in own else points.normal
+        normal = filled(view, own[view.name], points.normal) if view.name in own else points.normal
         picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
         picture[view.mask] = np.where(points.hit[:, None], normal, np.nan)
         if points.hit.any():
@@ -280,10 +284,10 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
 
     device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    grid, surface = rough_shape(used, progress)
+    grid, surface = rough_shape(used, settings.preset, progress)
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
-        maps = normal_maps(*thinned(used, start), device)
+        maps = normal_maps(*thinned(used, start), device, every_other=settings.preset == "draft")
     law, free = Law(SHARPNESS), lights is None
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":

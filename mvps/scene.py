@@ -133,6 +133,11 @@ class View:
         return np.argwhere(self.mask).astype(np.int32)
 
     @cached_property
+    def every_other(self) -> Int:
+        """(n,) positions in `pixels` of half of them, like the white squares of a chessboard."""
+        return np.flatnonzero(self.pixels.sum(1) % 2 == 0)
+
+    @cached_property
     def pixel_index(self) -> Int:
         """(height, width) position of a pixel in `pixels`, -1 in the background."""
         index = np.full(self.mask.shape, -1, np.int32)

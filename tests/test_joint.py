@@ -20,14 +20,14 @@ from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, v
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights, of_one_normal
-from mvps.joint.pixels import all_pixel_normals
+from mvps.joint.pixels import all_pixel_normals, filled
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import fuse
 from mvps.mesh import face_normals, isotropic_remesh, normalise, vertex_normals
-from mvps.scene import Capture, Law, Lights, Material, Surface
+from mvps.scene import Capture, Law, Lights, Material, NormalMap, Surface
 
 CPU = torch.device("cpu")
 
@@ -146,6 +146,34 @@ def test_pixels_keep_the_normals_that_explain_them(scene: SphereScene) -> None:
         degrees(m.normal, truth[view.mask]) for m, truth, view in zip(again, reconstruction.normal_maps, scene.capture.views, strict=True)
     ]
     assert np.median(np.concatenate(errors)) < 1.0
+
+
+def test_pixels_between_solved_ones_take_what_these_differ_by_from_the_vertices(scene: SphereScene) -> None:
+    reconstruction, view = scene.reconstruction, scene.capture.views[0]
+    true = reconstruction.normal_maps[0][view.mask]
+    known = np.isfinite(true).all(1)
+    true = np.where(known[:, None], true, (0.0, 0.0, 1.0)).astype(np.float32)
+    # Vertices are off by as much everywhere: the difference is known at once.
+    rough = true + np.array([0.1, -0.05, 0.02])
+    even = view.pixels.sum(1) % 2 == 0
+    maps = NormalMap(np.where(even[:, None], true, (1.0, 0.0, 0.0)), np.ones((len(true), 3)), even.astype(np.float32))
+    result = filled(view, maps, rough)
+    rows, columns = np.indices(view.mask.shape)
+    solved = np.pad(view.mask & ((rows + columns) % 2 == 0), 1)
+    around = (solved[:-2, 1:-1] | solved[2:, 1:-1] | solved[1:-1, :-2] | solved[1:-1, 2:])[view.mask]
+    assert np.array_equal(result[even], maps.normal[even])
+    assert np.allclose(result[~even & around], true[~even & around], atol=1e-6)
+    assert np.allclose(result[~even & ~around], normalise(rough)[~even & ~around])
+
+
+def test_every_other_pixel_leaves_the_others_to_be_filled(scene: SphereScene) -> None:
+    r, capture = scene.reconstruction, scene.capture
+    halves = all_pixel_normals(capture, r.surface, r.material, r.lights, None, CPU, every_other=True)
+    for view, maps, truth in zip(capture.views, halves, r.normal_maps, strict=True):
+        solved = maps.confidence > 0
+        assert not solved[view.pixels.sum(1) % 2 == 1].any() and solved.mean() > 0.4
+        errors = degrees(filled(view, maps, truth[view.mask])[~solved], truth[view.mask][~solved])
+        assert np.nanmedian(errors) < 0.5
 
 
 def test_smallest_rotations_turn_source_to_target() -> None:

@@ -71,9 +71,9 @@ def pixel_normals(
     """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
 
     sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3);
-    quick: lights of the first steps; every_other: only half of the pixels, like the white squares of a chessboard; confidence 0 elsewhere.
+    quick: lights of the first steps; every_other: only `view.every_other`; confidence 0 elsewhere.
     """
-    chosen = np.flatnonzero(view.pixels.sum(1) % 2 == 0) if every_other else np.arange(len(view.pixels))
+    chosen = view.every_other if every_other else np.arange(len(view.pixels))
     points = points_under(caster, material, view.camera, view.pixels[chosen])
     hit = np.flatnonzero(points.hit)
     rows, shadow = chosen[hit], shadow_at(caster, points, direction)[hit]
@@ -103,6 +103,17 @@ def pixel_normals(
         # What is known comes from the vertex, which other views saw under other lights.
         certain[rows] = np.maximum(certain[rows], points.confidence[hit])
     return NormalMap(normals, albedo, certain)
+
+
+def filled(view: View, maps: NormalMap, rough: Float) -> Float:
+    """Normals (pixels, 3) of a view: the solved ones of its map, and between them rough ones (pixels, 3), those of the vertices, plus the
+    mean of what the solved ones among a pixel's four neighbours differ from theirs: what vertices blur neighbours share."""
+    solved = maps.confidence > 0
+    difference = np.zeros((view.mask.shape[0] + 2, view.mask.shape[1] + 2, 4))
+    difference[1:-1, 1:-1][view.mask] = np.column_stack([maps.normal - rough, np.ones(len(solved))]) * solved[:, None]
+    around = difference[:-2, 1:-1] + difference[2:, 1:-1] + difference[1:-1, :-2] + difference[1:-1, 2:]
+    total = around[view.mask]
+    return np.where(solved[:, None], maps.normal, normalise(rough + total[:, :3] / np.maximum(total[:, 3:], 1)))
 
 
 def all_pixel_normals(

@@ -89,14 +89,16 @@ class RoundSettings:
 class RefineSettings:
     """rounds: in order; free_lights: solve the lights; final: this is the result, so the components of the reflectance model are chosen by
     held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
-    last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, and
-    draws fewer rays than there are pixels, so the last round leaves the surface and half of the pixels."""
+    last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
+    the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels, or for
+    Stage I, which draws fewer rays than there are pixels."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
     final: bool = False
     in_full: bool = False
     for_field: bool = False
+    half: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +190,7 @@ def refine(
         leaves_surface = settings.for_field and not pending
         if round_settings.photometric:
             every_light = settings.in_full and not pending
-            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, leaves_surface, device)
+            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device)
             changes = photometric_round(state, capture, task, carried, generator)
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
