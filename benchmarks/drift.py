@@ -45,7 +45,7 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     """One record of errors a round."""
     capture, truth, settings, progress = read_capture(path), read_truth(path), Settings(str(path)), Progress()
     device = chosen_device(settings.device)
-    grid, hull = rough_shape(capture, settings.preset, progress)
+    grid, hull = rough_shape(capture, progress)
     lights = first_lights(capture, hull, None, settings.seed, progress)
     maps = normal_maps(*thinned(capture, lights), device)
     rough = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)

@@ -30,7 +30,7 @@ BOUNCES = 3
 """What is left after three is below r^4 of the occluded part: 0.1 % for a white bowl, nothing elsewhere."""
 
 PATCH_EDGES = 3.0
-"""Size of a patch over the mesh's edges: some eight vertices. With 5 hollows of a few pixels share a patch with their rims (docs/method.md)."""
+"""Size of a patch over the mesh's edges: some eight vertices; with 5 narrow hollows share a patch with their rims (docs/method.md)."""
 
 NEIGHBOURS = 4
 """Patches that a point interpolates."""

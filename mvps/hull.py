@@ -143,8 +143,8 @@ def visual_hull(grid: SignedDistanceGrid) -> Surface:
     return largest_component(Surface(grid.origin + grid.spacing * vertices.astype(np.float64), faces))
 
 
-def default_cells(capture: Capture, width: float = 2.0) -> int:
-    """Cells along the object so that one is about `width` pixels wide: below two pixels the masks themselves carry no shape."""
+def default_cells(capture: Capture) -> int:
+    """Cells along the object so that one cell is about two pixels: below that the masks themselves carry no shape."""
     low, high = bounds(capture)
     pixel = pixel_footprint([view.camera for view in capture.views], (low + high) / 2)
-    return int(np.clip(round(float((high - low).max()) / (width * pixel)), 24, 192))
+    return int(np.clip(round(float((high - low).max()) / (2 * pixel)), 24, 192))

@@ -33,9 +33,6 @@ TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
 
-HULL_CELL = {"draft": 3.0, "standard": 2.0, "fine": 2.0}
-"""Pixels along a cell of the hull: two are what masks can tell, and Stage I starts from them; three are the edges of the first mesh."""
-
 GOOD_HULL = 0.2
 """Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
 captures, docs/method.md), so it would do no better."""
@@ -114,12 +111,12 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     return used, capture.select(rest) if rest else None
 
 
-def rough_shape(capture: Capture, preset: str, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
+def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
     from mvps.hull import default_cells, signed_distance, visual_hull
 
     with progress.stage("visual hull") as stage:
-        grid = signed_distance(capture, default_cells(capture, HULL_CELL[preset]))
+        grid = signed_distance(capture, default_cells(capture))
         surface = visual_hull(grid)
         stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing:.3g} units")
     return grid, surface
@@ -284,10 +281,10 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
 
     device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    grid, surface = rough_shape(used, settings.preset, progress)
+    grid, surface = rough_shape(used, progress)
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
-        maps = normal_maps(*thinned(used, start), device, every_other=settings.preset == "draft")
+        maps = normal_maps(*thinned(used, start), device, every_other=True)
     law, free = Law(SHARPNESS), lights is None
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":

@@ -110,9 +110,9 @@ class _Sums:
 
 
 def _sums(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: Tensor, rigs: list[int]
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: list[Tensor], rigs: list[int]
 ) -> _Sums:
-    """Over some views with their lights, rotations (views, 3, 3) and rigs, -1 where the lights are known."""
+    """Over some views with their lights, rotations and rigs, -1 where the lights are known."""
     n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
     size = {rig: len(of_view.intensity) for rig, of_view in zip(rigs, lights, strict=True) if rig >= 0}
     sums = _Sums(
@@ -135,7 +135,7 @@ def _sums(
         batch.added(sums.vertices, weighted @ rows.mT)
         if not size:
             continue
-        of_light = light_jacobian(shaded, normal, towards, batch.lights, law, rotations[batch.views])
+        of_light = light_jacobian(shaded, normal, towards, batch.lights, law, torch.stack([rotations[i] for i in batch.views]))
         for k, view in enumerate(batch.views):
             rig = rigs[view]
             sums.cross[rig].index_add_(0, index[k], weighted[k, :, :p, None] * of_light[k, :, None])
@@ -149,11 +149,11 @@ def _coupled(
     views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: list[Tensor], layout: _Layout
 ) -> _Sums:
     """The sums over all views, dealt to the cores as `vertex_equations` deals them."""
-    hands, every = min(WORKERS, len(views)), torch.stack(rotations)
+    hands = min(WORKERS, len(views))
     rigs = layout.rig if layout.lights else [-1] * len(views)
 
     def dealt(k: int) -> _Sums:
-        return _sums(views[k::hands], vertices, lights[k::hands], law, every[k::hands], rigs[k::hands])
+        return _sums(views[k::hands], vertices, lights[k::hands], law, rotations[k::hands], rigs[k::hands])
 
     total, *others = on_cores(dealt, range(hands))
     for other in others:

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 
 from mvps.cores import on_cores
-from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, evaluate, robust, tangents, vertex_derivatives
+from mvps.joint.blocks import WORKERS, DirectionalLights, Vertices, batches, evaluate, robust, tangents, vertex_derivatives
 from mvps.joint.observe import ViewSamples
 from mvps.joint.reflectance import Observed
 from mvps.joint.steps import confidence_of
@@ -67,21 +67,20 @@ def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[Directional
     hessian, meat, of_kinds = like.new_zeros(n, p, p), like.new_zeros(n, p, p), like.new_zeros(n, len(corners), p)
     squares, count = like.new_zeros(n), like.new_zeros(n)
     first, second = tangents(vertices.normal)
-    for samples, of_view in zip(views, lights, strict=True):
-        kind = torch.nn.functional.one_hot((of_view.direction @ corners.T).argmax(1), len(corners)).to(like)
-        for part in samples.chunks():
-            index, towards = samples.vertex[part], samples.towards[part]
-            shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
-            residual = shaded.predicted - samples.image[part]
-            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
-            rows = torch.stack(vertex_derivatives(shaded, (first[index], second[index]), towards, of_view), 1)
-            by_kind = ((rows * (weight * residual)[:, None]) @ kind).transpose(1, 2)
-            by_view = by_kind.sum(1)
-            hessian.index_add_(0, index, (rows * weight[:, None]) @ rows.transpose(1, 2))
-            meat.index_add_(0, index, by_view[:, :, None] * by_view[:, None])
-            of_kinds.index_add_(0, index, by_kind)
-            squares.index_add_(0, index, (weight * residual**2).sum(1))
-            count.index_add_(0, index, weight.sum(1))
+    for batch in batches(views, lights):
+        index, towards = batch.vertex, batch.towards
+        kind = torch.nn.functional.one_hot((batch.lights.direction @ corners.T).argmax(-1), len(corners)).to(like)
+        shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
+        residual = shaded.predicted - batch.image
+        weight = batch.weight * robust(residual, vertices.scale[index])
+        rows = torch.stack(vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights), -2)
+        by_kind = ((rows * (weight * residual)[..., None, :]) @ kind[:, None]).mT
+        by_view = by_kind.sum(-2)
+        batch.added(hessian, (rows * weight[..., None, :]) @ rows.mT)
+        batch.added(meat, by_view[..., :, None] * by_view[..., None, :])
+        batch.added(of_kinds, by_kind)
+        batch.added(squares, (weight * residual**2).sum(-1))
+        batch.added(count, weight.sum(-1))
     return hessian, meat, of_kinds, squares, count
 
 
