@@ -28,41 +28,32 @@ SWEEPS = 4
 PIXELS_PER_CHUNK = 4096
 
 
-def normal_maps(capture: Capture, lights: Lights, device: torch.device, every_other: bool = False) -> tuple[NormalMap, ...]:
+def normal_maps(capture: Capture, lights: Lights, device: torch.device) -> tuple[NormalMap, ...]:
     """`normal_map` of every view on its own, on all cores."""
     torch.set_num_threads(1)
 
     def of_view(view: View, direction: Float, intensity: Float) -> NormalMap:
-        return normal_map(view, direction, intensity, device, every_other)
+        return normal_map(view, direction, intensity, device)
 
     return tuple(on_cores(of_view, capture.views, lights.direction, lights.intensity))
 
 
-def normal_map(view: View, direction: Float, intensity: Float, device: torch.device, every_other: bool = False) -> NormalMap:
-    """Normals (world frame), albedo and confidence of a view's foreground pixels under lights direction, intensity (lights, 3).
-
-    every_other: only `view.every_other`; the others have no confidence.
-    """
+def normal_map(view: View, direction: Float, intensity: Float, device: torch.device) -> NormalMap:
+    """Normals (world frame), albedo and confidence of a view's foreground pixels under lights direction, intensity (lights, 3)."""
 
     def tensor(values: Float) -> Tensor:
         return torch.tensor(values, dtype=torch.float64, device=device)
 
     noise = float(view.scale / np.mean(intensity))
     light, per_channel = tensor(direction), tensor(view.scale / intensity)
-    chosen = view.every_other if every_other else np.arange(len(view.pixels))
-    towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels[chosen]))[1]), view.usable()
+    towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels))[1]), view.usable()
     columns: list[tuple[Tensor, ...]] = []
-    for start in range(0, len(chosen), PIXELS_PER_CHUNK):
-        here = slice(start, start + PIXELS_PER_CHUNK)
-        part = chosen[here]
+    for start in range(0, len(view.pixels), PIXELS_PER_CHUNK):
+        part = slice(start, start + PIXELS_PER_CHUNK)
         radiance = torch.from_numpy(view.samples[part].astype(np.float32)).to(device) * per_channel
         known = torch.from_numpy(usable[part]).to(device).double()
-        columns.append(tuple(values.float() for values in pixels_solved(radiance, known, light, towards[here], noise)))
-    pixels = len(view.pixels)
-    normal = np.tile(-view.camera.rotation[2].astype(np.float32), (pixels, 1))
-    albedo, confidence = np.zeros((pixels, 3), np.float32), np.zeros(pixels, np.float32)
-    for values, column in zip((normal, albedo, confidence), zip(*columns, strict=True), strict=True):
-        values[chosen] = torch.cat(column).cpu().numpy()
+        columns.append(tuple(values.float() for values in pixels_solved(radiance, known, light, towards[part], noise)))
+    normal, albedo, confidence = (torch.cat(column).cpu().numpy() for column in zip(*columns, strict=True))
     return NormalMap(normal, albedo, confidence)
 
 

@@ -284,7 +284,7 @@ def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, pro
     grid, surface = rough_shape(used, progress)
     start = first_lights(used, surface, lights, settings.seed, progress)
     with progress.stage("photometric stereo"):
-        maps = normal_maps(*thinned(used, start), device, every_other=True)
+        maps = normal_maps(*thinned(used, start), device)
     law, free = Law(SHARPNESS), lights is None
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":

@@ -164,16 +164,6 @@ def test_photometric_stereo_of_a_lambertian_sphere(scene: SphereScene) -> None:
     assert sure.mean() > 0.7 and np.abs(maps.albedo - expected)[sure].max() < 0.02
 
 
-def test_every_other_pixel_is_solved_as_among_all(scene: SphereScene) -> None:
-    capture, lights, _ = lambertian(scene)
-    view = capture.views[0]
-    whole, half = (normal_map(view, lights.direction[0], lights.intensity[0], CPU, every_other) for every_other in (False, True))
-    rest = np.setdiff1d(np.arange(len(view.pixels)), view.every_other)
-    assert abs(len(rest) - len(view.every_other)) < 0.1 * len(rest) and not half.confidence[rest].any()
-    for name in ("normal", "albedo", "confidence"):
-        assert np.allclose(getattr(half, name)[view.every_other], getattr(whole, name)[view.every_other], atol=1e-5)
-
-
 def test_shadows_highlights_and_saturation_are_outvoted(scene: SphereScene) -> None:
     capture, lights, _ = lambertian(scene)
     view = capture.views[0]
