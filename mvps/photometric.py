@@ -22,7 +22,7 @@ from torch.nn.functional import normalize
 from mvps.camera import pixel_centres, rays
 from mvps.cores import on_cores
 from mvps.scene import RELIABLE, Capture, Float, Lights, NormalMap, View
-from solvers.least_squares import cauchy_weights, weighted_rows
+from solvers.least_squares import ascending, cauchy_weights, weighted_rows
 
 SWEEPS = 4
 PIXELS_PER_CHUNK = 4096
@@ -74,7 +74,8 @@ def pixels_solved(radiance: Tensor, known: Tensor, light: Tensor, towards: Tenso
 
 def _solve(image: Tensor, known: Tensor, light: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
     """Robust b (n, 3), final weights (n, lights) and standard deviation of the normal (n,), infinite where three lights are missing."""
-    weight = known * (image > 0.1 * image.quantile(0.8, dim=1, keepdim=True))
+    bright = ascending(image)[:, round(0.8 * (image.shape[1] - 1)), None]
+    weight = known * (image > 0.1 * bright)
     for _ in range(SWEEPS):
         b = weighted_rows(image, weight, light, ridge=1e-6)
         shading = b @ light.T
