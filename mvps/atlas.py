@@ -23,7 +23,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from mvps.mesh import face_areas, face_normals, normalise
+from mvps.mesh import edge_numbers, face_areas, face_normals, normalise
 from mvps.scene import Bool, Float, Int, Surface, checked
 
 AXES = normalise(
@@ -74,8 +74,9 @@ def build_atlas(surface: Surface, texel: float) -> Atlas:
     """An atlas with texels of side `texel`, world units (measured in the plane of projection)."""
     if not texel > 0:
         raise ValueError(f"texel: wanted a positive length in world units, given {texel}")
-    axis = _labels(surface, texel)
-    chart, axis = _without_overlaps(surface, axis, texel)
+    pairs = _adjacency(surface.faces)
+    axis = _labels(surface, pairs, texel)
+    chart, axis = _without_overlaps(surface, pairs, axis, texel)
     return _packed(surface, chart, axis, texel)
 
 
@@ -137,9 +138,9 @@ def _covered(points: Float, faces: Int) -> Texels:
 
 def _adjacency(faces: Int) -> Int:
     """(pairs, 2) faces that share an edge; an edge of more than two faces joins consecutive ones."""
-    halves = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    order = np.lexsort((halves[:, 1], halves[:, 0]))
-    same = (halves[order[1:]] == halves[order[:-1]]).all(1)
+    number = edge_numbers(faces, int(faces.max(initial=0)) + 1).ravel()
+    order = np.argsort(number, kind="stable")
+    same = np.diff(number[order]) == 0
     return np.stack([order[:-1][same] // 3, order[1:][same] // 3], -1)
 
 
@@ -151,9 +152,9 @@ def _components(pairs: Int, label: Int) -> Int:
     return component
 
 
-def _labels(surface: Surface, texel: float) -> Int:
-    """(F,) positions in AXES, from smoothed normals, small patches joined to neighbours."""
-    normals, areas, pairs = face_normals(surface), face_areas(surface), _adjacency(surface.faces)
+def _labels(surface: Surface, pairs: Int, texel: float) -> Int:
+    """(F,) positions in AXES, from smoothed normals, small patches joined to neighbours; pairs (n, 2) of adjacent faces."""
+    normals, areas = face_normals(surface), face_areas(surface)
     n = len(normals)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     mean = sp.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(n, n)) + sp.eye(n, format="csr")
@@ -162,16 +163,17 @@ def _labels(surface: Surface, texel: float) -> Int:
         smooth = normalise(mean @ smooth)
     facing = normals @ AXES.T
     label: Int = np.where(facing > STEEPEST, smooth @ AXES.T, facing - 2).argmax(1)
-    while True:
-        joined = _join_small(label, pairs, areas / texel**2, facing)
-        if _components(pairs, joined).max() >= _components(pairs, label).max():
-            return label
-        label = joined
-
-
-def _join_small(label: Int, pairs: Int, areas: Float, facing: Float) -> Int:
-    """Labels with every small component that can given the label of the larger neighbour with which it shares most edges."""
     component = _components(pairs, label)
+    while True:
+        joined = _join_small(label, component, pairs, areas / texel**2, facing)
+        after = _components(pairs, joined)
+        if after.max() >= component.max():
+            return label
+        label, component = joined, after
+
+
+def _join_small(label: Int, component: Int, pairs: Int, areas: Float, facing: Float) -> Int:
+    """Labels with every small component (F,) of them that can given the label of the larger neighbour with which it shares most edges."""
     size = np.bincount(component, areas)
     ends = np.concatenate([pairs, pairs[:, ::-1]])
     ends = ends[component[ends[:, 0]] != component[ends[:, 1]]]
@@ -204,9 +206,9 @@ def _plane(surface: Surface, axis: Int, texel: float) -> Float:
     return np.stack([np.einsum("fkc,fc->fk", corners, tangent), -np.einsum("fkc,fc->fk", corners, bitangent)], -1)
 
 
-def _without_overlaps(surface: Surface, axis: Int, texel: float) -> tuple[Int, Int]:
-    """Charts (F,) and their axes (charts,): components of one axis, split until no texel centre lies under two faces of one."""
-    pairs = _adjacency(surface.faces)
+def _without_overlaps(surface: Surface, pairs: Int, axis: Int, texel: float) -> tuple[Int, Int]:
+    """Charts (F,) and their axes (charts,): components of one axis, split until no texel centre lies under two faces of one. pairs (n, 2)
+    of adjacent faces."""
     flat = _plane(surface, axis, texel).reshape(-1, 2)
     soup = np.arange(len(flat)).reshape(-1, 3)
     depth = (surface.vertices[surface.faces] * AXES[axis][:, None]).sum(-1)
@@ -262,8 +264,9 @@ def _narrowest(points: Float) -> float:
 
 def _packed(surface: Surface, chart: Int, axis: Int, texel: float) -> Atlas:
     """The charts (F,) with axes (charts,) side by side in one atlas."""
-    key, inverse = np.unique(np.stack([np.repeat(chart, 3), surface.faces.ravel()], -1), axis=0, return_inverse=True)
-    faces, vertex, of_chart = inverse.reshape(-1, 3), key[:, 1], key[:, 0]
+    n = len(surface.vertices)
+    key, inverse = np.unique(np.repeat(chart, 3) * n + surface.faces.ravel(), return_inverse=True)
+    faces, vertex, of_chart = inverse.reshape(-1, 3), key % n, key // n
     tangent, bitangent = _frame(AXES[axis])
     start = np.searchsorted(of_chart, np.arange(len(axis) + 1))
     points = np.empty((len(key), 2))

@@ -52,8 +52,9 @@ def gather(surface: Surface, size: float) -> Gather:
     keep two sides."""
     caster, normals = ray_caster(surface), vertex_normals(surface)
     cube = np.floor((surface.vertices - surface.vertices.min(0)) / size).astype(np.int64)
-    key = np.column_stack([cube, normals > 0])
-    _, vertex, patch = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    octant = (normals > 0) @ (4, 2, 1)
+    key = np.ravel_multi_index((*cube.T, octant), (*cube.max(0) + 1, 8))
+    _, vertex, patch = np.unique(key, return_index=True, return_inverse=True)
     normal, places = normals[vertex], surface.vertices[vertex]
     directions = _around(normal, _cosine_directions(RAYS))
     origins = np.repeat(places + mean_edge_length(surface) / 2 * normal, RAYS, axis=0)
@@ -62,7 +63,7 @@ def gather(surface: Surface, size: float) -> Gather:
     seen = np.flatnonzero(hits.face >= 0)
     seen = seen[(face_normals(surface)[hits.face[seen]] * directions[seen]).sum(1) < 0]
     rows = seen // RAYS
-    columns = patch.ravel()[surface.faces[hits.face[seen], 0]]
+    columns = patch[surface.faces[hits.face[seen], 0]]
     S = sp.csr_matrix((np.full(len(rows), 1 / RAYS, np.float32), (rows, columns)), (len(vertex), len(vertex)))
     return Gather(caster, vertex, normal, S, cKDTree(places))
 

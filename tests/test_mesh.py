@@ -40,6 +40,12 @@ def test_vertex_normals_are_made_once_for_a_surface_and_are_angle_weighted() -> 
     assert np.allclose(mesh.vertex_normals(stretched), igl.per_vertex_normals(stretched.vertices, stretched.faces, angle))
 
 
+def test_edges_are_the_pairs_of_the_faces_corners_each_once_in_order() -> None:
+    for surface in (sphere(2), sheet(5)):
+        pairs = {tuple(sorted((int(f[k]), int(f[k - 1])))) for f in surface.faces for k in range(3)}
+        assert [tuple(pair) for pair in mesh.edges(surface).tolist()] == sorted(pairs)
+
+
 def test_degenerate_faces_do_not_spoil_normals() -> None:
     ball = sphere(2)
     spoiled = Surface(ball.vertices, np.concatenate([ball.faces, [[0, 0, 1], [2, 2, 2]]]))
