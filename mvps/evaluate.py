@@ -33,6 +33,7 @@ ROWS = (
     Row("Chamfer distance, mm", ("chamfer_mm", "", ""), "{:.3f}"),
     Row("Chamfer distance, pixels", ("chamfer_px", "", ""), "{:.3f}"),
     Row("mean signed offset, pixels (negative: inside)", ("offset_px", "", ""), "{:+.3f}"),
+    Row("median signed offset, pixels", ("offset_median_px", "", ""), "{:+.3f}"),
     Row("F-score at 0.5 mm", ("f_score_0_5_mm", "", ""), "{:.3f}"),
     Row("F-score at 1 mm", ("f_score_1_mm", "", ""), "{:.3f}"),
     Row("share of the mask that the mesh covers", ("mesh_coverage", "", ""), "{:.4f}"),

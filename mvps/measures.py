@@ -6,7 +6,8 @@ Distance         d(p, S) = min over the triangles of S of |p - q|, exact; accura
                  mean d(p_truth, result), Chamfer = (accuracy + completeness) / 2, not squared. Figures called _mm are in
                  the capture's own unit, millimetres by convention; _px are divided by what a pixel covers at the object.
 F-score          harmonic mean of the shares of both point sets that are nearer than a threshold (Knapitsch et al. 2017).
-Signed offset    mean of +-d(p_result, truth), negative inside: the sign of (p - q) . normal(q).
+Signed offset    mean and median of +-d(p_result, truth), negative inside: the sign of (p - q) . normal(q). The median is what the whole
+                 surface is shifted by; the mean also counts hollows that stay too shallow.
 Normals          angle(a, b) = 2 atan2(|a - b|, |a + b|) (Kahan), exact for small angles too.
 Lights           one scale for all lights and channels, s = (e . t) / (e . e); error = mean |s e - t| / t (Chen et al. 2019, eq. 8).
 Confidence       pixels by rising stated error in groups of equal number; stated mean angle sqrt(pi / 2) sigma (Rayleigh's distribution,
@@ -88,7 +89,8 @@ def surface_errors(surface: Surface, truth: Surface, capture: Capture) -> dict[s
     distances = {"accuracy": accuracy, "completeness": completeness, "chamfer": (accuracy + completeness) / 2}
     errors = {f"{name}_mm": value for name, value in distances.items()}
     errors |= {f"{name}_px": value / pixel for name, value in distances.items()}
-    errors |= {"offset_px": float(signed.mean()) / pixel, "pixel_mm": pixel}
+    offsets = {"offset_px": float(signed.mean()) / pixel, "offset_median_px": float(np.median(signed)) / pixel}
+    errors |= offsets | {"pixel_mm": pixel}
     errors["mesh_coverage"] = len(result_points) / sum(int(view.mask.sum()) for view in capture.views)
     for threshold in F_SCORE_THRESHOLDS:
         precision, recall = float((to_truth < threshold).mean()), float((to_result < threshold).mean())

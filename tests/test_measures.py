@@ -77,6 +77,7 @@ def test_concentric_spheres_are_their_radii_apart(offset: float, scale: float) -
     assert errors["pixel_mm"] == pytest.approx(500 / 400 * scale)
     assert errors["chamfer_px"] == pytest.approx(abs(offset) * 400 / 500, rel=3e-3)
     assert errors["offset_px"] == pytest.approx(offset * 400 / 500, rel=3e-3)
+    assert errors["offset_median_px"] == pytest.approx(offset * 400 / 500, rel=3e-3)
     if scale == 1:
         assert (errors["f_score_0_5_mm"], errors["f_score_1_mm"]) == (0, 1)
         assert errors["mesh_coverage"] == (1 if offset > 0 else pytest.approx(0.95, abs=0.05))
