@@ -300,6 +300,7 @@ def test_thinned_views_keep_other_lights_and_their_own_light(scene: SphereScene)
     direction, intensity = (np.tile(values[0], (times, 1)) for values in (lights.direction, lights.intensity))
     numbered = intensity * np.arange(1, len(intensity) + 1)[:, None]
     part, kept = thinned(crowd, Lights((direction,) * 21, (numbered,) * 21, True))
+    assert thinned(crowd, Lights((direction,) * 21, (2 * numbered,) * 21, True))[0] is part, "its samples are copied once"
     sizes = [len(v.lights) for v in part.views]
     assert min(sizes) >= ENOUGH_LIGHTS and max(sizes) < len(many.lights) and sum(sizes) >= ENOUGH_PHOTOGRAPHS
     assert {number for v in part.views for number in v.lights} == set(many.lights)

@@ -7,6 +7,7 @@ the largest number that leaves ENOUGH_LIGHTS of each view and ENOUGH_PHOTOGRAPHS
 from __future__ import annotations
 
 from collections.abc import Sequence
+from weakref import WeakKeyDictionary
 
 from mvps.scene import Capture, Lights
 
@@ -24,12 +25,18 @@ def kept(counts: Sequence[int]) -> list[slice]:
     return [slice(i % k, None, k) for i, k in enumerate(steps)]
 
 
+_parts: WeakKeyDictionary[Capture, Capture] = WeakKeyDictionary()
+
+
 def thinned(capture: Capture, lights: Lights) -> tuple[Capture, Lights]:
-    """The capture with the kept lights of each view, and these lights."""
+    """The capture with the kept lights of each view, its samples copied once for a capture, and these lights."""
     keep = kept([len(view.lights) for view in capture.views])
     if all(rows.step == 1 for rows in keep):
         return capture, lights
-    part = capture.select({view.name: view.lights[rows] for view, rows in zip(capture.views, keep, strict=True)})
+    part = _parts.get(capture)
+    if part is None:
+        numbers = {view.name: view.lights[rows] for view, rows in zip(capture.views, keep, strict=True)}
+        part = _parts[capture] = capture.select(numbers)
     direction, intensity = (
         tuple(values[rows] for rows, values in zip(keep, of_views, strict=True)) for of_views in (lights.direction, lights.intensity)
     )
