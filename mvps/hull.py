@@ -17,9 +17,9 @@ from skimage.measure import marching_cubes
 
 from mvps.camera import inside_image, pixel_footprint, project
 from mvps.cores import on_cores
-from mvps.mesh import largest_component
+from mvps.mesh import largest_component, lengths
 from mvps.scene import Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
-from mvps.silhouette import mask_distance, sampled
+from mvps.silhouette import mask_distances, sampled
 
 MARGIN_CELLS = 3
 """Cells of free space kept around the hull, so that the level set closes inside the grid."""
@@ -73,18 +73,18 @@ def _distance(view: View, field: NDArray[np.float32], points: Float) -> NDArray[
     image, depth = project(view.camera, points)
     pixels = sampled(field, image)
     # Beyond the image nothing was photographed: such points are outside, at least by their distance to the image.
-    outside = ~inside_image(view.camera, image)
+    outside = np.flatnonzero(~inside_image(view.camera, image))
     limit = np.array([view.camera.width, view.camera.height])
-    beyond = np.linalg.norm(np.maximum(np.maximum(-image, image - limit), 0), axis=-1)
-    distance = np.where(outside, np.maximum(pixels, 0.5) + beyond, pixels) * depth / view.camera.focal_length
-    return np.where(depth > 0, distance, np.inf).astype(np.float32)
+    beyond = lengths(np.maximum(np.maximum(-image[outside], image[outside] - limit), 0))
+    pixels[outside] = np.maximum(pixels[outside], 0.5) + beyond
+    return np.where(depth > 0, pixels * depth / view.camera.focal_length, np.inf).astype(np.float32)
 
 
 class _Masks:
     """The silhouette cones of all views."""
 
     def __init__(self, capture: Capture) -> None:
-        self._views = [(view, mask_distance(view.mask)) for view in capture.views]
+        self._views = list(zip(capture.views, mask_distances(capture), strict=True))
 
     def cut(self, points: Float) -> NDArray[np.float32]:
         """The hull's signed distance (n,) at world points (n, 3)."""

@@ -16,6 +16,7 @@ exactly to first order (Cipolla and Giblin 2000). The mask therefore wants  d = 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -23,8 +24,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from mvps.camera import footprint, project, rays
+from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise
-from mvps.scene import Bool, Camera, Float, Int
+from mvps.scene import Bool, Camera, Capture, Float, Int
 from mvps.visibility import RayCaster
 
 STAIRCASE_PIXELS = 1.0
@@ -62,6 +64,17 @@ def mask_distance(mask: Bool) -> NDArray[np.float32]:
     signed = np.where(mask, 0.5 - inside, outside - 0.5)
     smooth: NDArray[np.float32] = gaussian_filter(signed, STAIRCASE_PIXELS, mode="nearest").astype(np.float32)
     return smooth
+
+
+_distances: WeakKeyDictionary[Capture, list[NDArray[np.float32]]] = WeakKeyDictionary()
+
+
+def mask_distances(capture: Capture) -> list[NDArray[np.float32]]:
+    """`mask_distance` of every view, made once for a capture, on all cores."""
+    found = _distances.get(capture)
+    if found is None:
+        found = _distances[capture] = on_cores(mask_distance, [view.mask for view in capture.views])
+    return found
 
 
 def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:

@@ -37,7 +37,7 @@ LARGEST_SIDE = 4096
 """Textures larger than this, texels, do not load on every graphics card."""
 FILLED = 0.4
 """Share of an atlas that charts cover, about; used only to keep below LARGEST_SIDE."""
-SAMPLES_PER_CHUNK = 1 << 20
+SAMPLES_PER_CHUNK = 1 << 16
 TEXELS_PER_CHUNK = 1 << 18
 REWEIGHTINGS = 4
 STEEPEST_VIEW = 0.2

@@ -11,7 +11,7 @@ from mvps.joint.refine import POSITION_FLOOR_PIXELS
 from mvps.joint.vertices import with_masks
 from mvps.mesh import normalise, unbiased
 from mvps.scene import Camera, Surface
-from mvps.silhouette import mask_distance, outline, sampled
+from mvps.silhouette import mask_distance, mask_distances, outline, sampled
 from mvps.visibility import RayCaster
 
 BALL = make_sphere(5).reconstruction.surface
@@ -68,7 +68,7 @@ def test_masks_bring_a_ball_to_its_size() -> None:
     for factor in (0.98, 1.02):
         wrong = Surface(factor * BALL.vertices, BALL.faces)
         nothing = Agreement(np.zeros(len(BALL.vertices)), np.full(len(BALL.vertices), np.inf))
-        told = with_masks(nothing, scene.capture, wrong, [mask_distance(view.mask) for view in scene.capture.views], POSITION_FLOOR_PIXELS)
+        told = with_masks(nothing, scene.capture, wrong, mask_distances(scene.capture), POSITION_FLOOR_PIXELS)
         known = np.isfinite(told.sigma)
         assert known.sum() > 300 and abs(told.offset[known].mean() - (1 - factor) * RADIUS) < 0.1
         assert np.abs(told.offset[known] - (1 - factor) * RADIUS).max() < 0.6

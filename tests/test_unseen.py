@@ -9,11 +9,11 @@ from sphere_scene import RADIUS, make_sphere
 
 from mvps.joint.unseen import closed_over
 from mvps.scene import Surface
-from mvps.silhouette import mask_distance
+from mvps.silhouette import mask_distances
 
 SCENE = make_sphere(4)
 BALL = SCENE.reconstruction.surface
-DISTANCE = [mask_distance(view.mask) for view in SCENE.capture.views]
+DISTANCE = mask_distances(SCENE.capture)
 SEEN = BALL.vertices[:, 2] > -0.8 * RADIUS
 
 

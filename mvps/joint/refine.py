@@ -42,7 +42,7 @@ from mvps.material import Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
-from mvps.silhouette import mask_distance
+from mvps.silhouette import mask_distances
 
 NORMAL_SIGMA = 0.03
 """Standard deviation of the views' normals, radians, in the fusion with positions: half of all pixels are better than 1 to 2 degrees."""
@@ -124,7 +124,7 @@ def _moved(
     """The surface moved to where views and masks agree, with the views' normals; what no view sees follows smoothly. otherwise (V, 3):
     normals where no view sees."""
     floor = POSITION_FLOOR_PIXELS * pixel
-    distance = [mask_distance(view.mask) for view in capture.views]
+    distance = mask_distances(capture)
     factor, start = None, surface.vertices
     for _ in range(settings.fusions):
         if min(len(view.lights) for view in capture.views) < OWN_LIGHTS:
