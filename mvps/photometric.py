@@ -14,6 +14,8 @@ third of the number of lights.
 
 from __future__ import annotations
 
+from math import ceil, floor
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -72,10 +74,17 @@ def pixels_solved(radiance: Tensor, known: Tensor, light: Tensor, towards: Tenso
     return normal, _albedo(radiance, (normal @ light.T).clamp_min(0), weight), confidence
 
 
+def _quantile(rows: Tensor, share: float) -> Tensor:
+    """(m, 1) quantiles of rows (m, n), interpolated between neighbours."""
+    place = share * (rows.shape[1] - 1)
+    ordered = ascending(rows)
+    low, high = (ordered[:, index, None] for index in (floor(place), ceil(place)))
+    return torch.lerp(low, high, place - floor(place))
+
+
 def _solve(image: Tensor, known: Tensor, light: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
     """Robust b (n, 3), final weights (n, lights) and standard deviation of the normal (n,), infinite where three lights are missing."""
-    bright = ascending(image)[:, round(0.8 * (image.shape[1] - 1)), None]
-    weight = known * (image > 0.1 * bright)
+    weight = known * (image > 0.1 * _quantile(image, 0.8))
     for _ in range(SWEEPS):
         b = weighted_rows(image, weight, light, ridge=1e-6)
         shading = b @ light.T
