@@ -7,7 +7,8 @@ covariance
 
     H^-1 (s^2 H + sum_views g_c g_c^T + sum_lights g_c g_c^T) H^-1
 
-(sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011). Last, no surface has the
+(sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011). Lights nearest to the same of
+twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Last, no surface has the
 normals n of all vertices: fused positions keep only what is integrable of them, and of an error without any pattern half is. So how far n
 is from the normal m of the surface is one more sign of error. Of each tangential component
 
