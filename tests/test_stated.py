@@ -66,9 +66,10 @@ def of_view(samples: ViewSamples, draw: torch.Generator) -> torch.Tensor:
     return 0.05 * slope * torch.randn(len(samples.vertex), 1, generator=draw)
 
 
-@pytest.mark.parametrize("error", [independent, of_view])
-def test_stated_errors_are_no_smaller_than_those_that_come_out(scene: SphereScene, error: Callable[..., torch.Tensor]) -> None:
-    """And up to three times as large: where samples share nothing, each of the sums over samples, views and lights says the whole error."""
+@pytest.mark.parametrize(("error", "most"), [(independent, 2.5), (of_view, 3.0)])
+def test_stated_errors_are_no_smaller_than_those_that_come_out(scene: SphereScene, error: Callable[..., torch.Tensor], most: float) -> None:
+    """They err on the safe side. Where samples share nothing, the sums over samples, views and lights and what the surface contradicts each
+    say the whole error: twice as large. Slopes of views partly cancel in a view but not under a light, which then says still more."""
     views, truth, lights = photographed(scene)
     draw = torch.Generator().manual_seed(0)
     wrong = [replace(samples, image=samples.image + error(samples, draw)) for samples in views]
@@ -76,7 +77,7 @@ def test_stated_errors_are_no_smaller_than_those_that_come_out(scene: SphereScen
     stated, measured = stated_deg(scene, wrong, found, lights), measured_deg(found, truth)
     known = np.flatnonzero(np.isfinite(stated))
     for group in np.array_split(known[np.argsort(stated[known])], 4):
-        assert 1 < np.sqrt((stated[group] ** 2).mean() / (measured[group] ** 2).mean()) < 3
+        assert 1 < np.sqrt((stated[group] ** 2).mean() / (measured[group] ** 2).mean()) < most
 
 
 def test_what_the_surface_contradicts_is_stated(scene: SphereScene) -> None:

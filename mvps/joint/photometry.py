@@ -24,7 +24,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathere
 from mvps.joint.patches import VERTICES_OF_PATCH, Patches, drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
-from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, mean_bend, vertex_step, vertex_steps, with_population
+from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose
@@ -148,10 +148,16 @@ def _choose_model(
 def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest: float) -> torch.Tensor:
     """(V,) how far a pixel at each vertex shows one normal: 1 / (1 + s d^2), where d radians is what normals (V, 3) change by along a pixel
     and s the sharpness of the object's sharpest lobe, which that spread of normals makes duller by this factor (Toksvig 2005)."""
-    ends = edges(surface)
+    pairs = edges(surface)
     # Neighbours within half a pixel share their samples: what they differ by is not seen.
-    length = np.maximum(lengths(surface.vertices[ends[:, 0]] - surface.vertices[ends[:, 1]]) / pixel, 0.5)
-    return 1 / (1 + sharpest * mean_bend(normal, torch.from_numpy(ends).to(normal.device), _tensor(length, normal.device)))
+    length = np.maximum(lengths(surface.vertices[pairs[:, 0]] - surface.vertices[pairs[:, 1]]) / pixel, 0.5)
+    ends = torch.from_numpy(pairs).to(normal.device)
+    change = (normal[ends[:, 0]] - normal[ends[:, 1]]).square().sum(1) / _tensor(length, normal.device) ** 2
+    total, count = torch.zeros_like(normal[:, 0]), torch.zeros_like(normal[:, 0])
+    for end in ends.T:
+        total.index_add_(0, end, change)
+        count.index_add_(0, end, torch.ones_like(change))
+    return 1 / (1 + sharpest * (total / count.clamp_min(1)))
 
 
 def _solve_lights(

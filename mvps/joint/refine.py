@@ -209,25 +209,28 @@ def refine(
     return replace(_finished(state, settings.final, account, device, generator), carried=carried)
 
 
-def _finished(state: State, final: bool, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator) -> Refined:
-    """What the rounds came to; if final, with albedo and lobes in the photographs' colours, and with the stated error."""
+def _coloured(state: State, device: torch.device, generator: np.random.Generator) -> Material:
+    """The material with albedo and lobes in the photographs' colours, a neural residual where that helps, and the stated error."""
     assert state.vertices is not None and state.under is not None
-    material = material_of(state, grey_albedo(state.vertices))
-    if final:
-        photographs, lights = state.under
-        ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
-        observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
-        coloured_lobes = False
-        if state.law.sharpness:
-            state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
-            coloured_lobes = state.trials[-1].kept
-        albedo, tint = colours(observed, ratios, coloured_lobes)
-        trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
-        state.trials.append(trial)
-        certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE), 0)
-        material = replace(material_of(state, albedo), confidence=certain, residual=residual)
-        if coloured_lobes:
-            material = replace(material, specular_weight=material.specular_weight[..., None] * tint)
+    photographs, lights = state.under
+    ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
+    observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
+    coloured_lobes = False
+    if state.law.sharpness:
+        state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
+        coloured_lobes = state.trials[-1].kept
+    albedo, tint = colours(observed, ratios, coloured_lobes)
+    trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
+    state.trials.append(trial)
+    certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE), 0)
+    material = replace(material_of(state, albedo), confidence=certain, residual=residual)
+    return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
+
+
+def _finished(state: State, final: bool, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator) -> Refined:
+    """What the rounds came to; in colour if final."""
+    assert state.vertices is not None
+    material = _coloured(state, device, generator) if final else material_of(state, grey_albedo(state.vertices))
     status, text = _verdict(account)
     return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
 

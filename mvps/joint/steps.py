@@ -148,16 +148,6 @@ def confidence(vertices: Vertices) -> Tensor:
     return confidence_of(vertices.sigma)
 
 
-def mean_bend(normal: Tensor, pairs: Tensor, length: Tensor) -> Tensor:
-    """(V,) mean square of what normals (V, 3) change by along the edges at a vertex, over their length; pairs (E, 2), length (E,)."""
-    change = (normal[pairs[:, 0]] - normal[pairs[:, 1]]).square().sum(1) / length**2
-    total, count = torch.zeros_like(normal[:, 0]), torch.zeros_like(normal[:, 0])
-    for end in pairs.T:
-        total.index_add_(0, end, change)
-        count.index_add_(0, end, torch.ones_like(change))
-    return total / count.clamp_min(1)
-
-
 def confidence_of(sigma: Tensor) -> Tensor:
     """Confidence (scene.py) in normals with standard deviations in radians."""
     certain: Tensor = 1 / (1 + (sigma / RELIABLE) ** 2)
