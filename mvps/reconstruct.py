@@ -65,7 +65,7 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     shallow hollows."""
     from mvps.joint.refine import RefineSettings, RoundSettings
 
-    rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.0 if final else 3.0, 2.0, 0.4))
+    rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.5 if final else 3.0, 2.0, 0.4))
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True)
 
 

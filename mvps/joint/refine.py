@@ -90,7 +90,7 @@ class RefineSettings:
     """rounds: in order; free_lights: solve the lights; final: this is the result, so the components of the reflectance model are chosen by
     held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
     last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
-    the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels, or for
+    the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels and more, or for
     Stage I, which draws fewer rays than there are pixels."""
 
     rounds: tuple[RoundSettings, ...]
