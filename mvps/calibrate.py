@@ -183,8 +183,9 @@ def _to_world(scaled: Float, camera: Camera, ratio: Float) -> tuple[Float, Float
     return scaled / length @ camera.rotation, length * ratio
 
 
-def uncalibrated_lights(capture: Capture, surface: Surface, seed: int) -> Calibration:
-    """Directions and intensities of all lights from the images and a rough surface's normals (module docstring)."""
+def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share: bool = True) -> Calibration:
+    """Directions and intensities of all lights from the images and a rough surface's normals (module docstring); may_share: one rig is
+    tried."""
     generator = np.random.default_rng(seed)
     caster, normal = ray_caster(surface), vertex_normals(surface)
     samples = [_sampled(view, caster, normal, generator) for view in capture.views]
@@ -195,7 +196,7 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int) -> Calibr
     separate = on_cores(lambda s: factorise(s.image, s.known, 3, floor=s.noise), samples)
     residual = float(np.sqrt(np.mean([f.residual**2 for f in separate])))
     fourth = float(np.mean([f.singular_values[3] for f in separate]))
-    if len(capture.views) > 1 and len(counts) == 1 and len({view.lights for view in capture.views}) == 1:
+    if may_share and len(capture.views) > 1 and len(counts) == 1 and len({view.lights for view in capture.views}) == 1:
         together = factorise(
             np.concatenate([s.image for s in samples]),
             np.concatenate([s.known for s in samples]),

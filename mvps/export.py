@@ -83,7 +83,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
     views = tuple(record["views"])
     try:
         with np.load(folder / "material.npz") as arrays:
-            values = {name: arrays[name] for name in _MATERIAL} | {name: float(arrays[name]) for name in _OF_ALL}
+            values = {name: arrays[name] for name in _MATERIAL} | {name: kind(arrays[name]) for name, kind in _OF_ALL.items()}
             material = Material(normal=mesh.normals, **values, residual=_residual(arrays))
         return Reconstruction(
             surface=Surface(mesh.vertices, mesh.faces),
@@ -104,7 +104,7 @@ def read_reconstruction(folder: Path) -> Reconstruction:
 
 
 _MATERIAL = ("albedo", "specular_weight", "sharpness", "confidence")
-_OF_ALL = ("grazing", "bounce")
+_OF_ALL = {"grazing": float, "bounce": float, "microfacet": bool, "shadows": bool}
 
 
 def _residual(arrays: Mapping[str, Any]) -> Residual | None:
@@ -172,7 +172,7 @@ def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
     colours = srgb_bytes(material.albedo / scale)
     mesh = PlyMesh(surface.vertices, material.normal, colours, surface.faces)
     arrays = io.BytesIO()
-    values = {name: getattr(material, name) for name in _MATERIAL + _OF_ALL} | _residual_arrays(material.residual)
+    values = {name: getattr(material, name) for name in (*_MATERIAL, *_OF_ALL)} | _residual_arrays(material.residual)
     np.savez(arrays, allow_pickle=False, **values)
     comment = f"colour = sRGB of albedo / {scale:.9g}; the normal is the refined shading normal"
     return {"mesh.ply": ply_bytes(mesh, comment), "material.npz": arrays.getvalue()}

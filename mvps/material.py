@@ -12,13 +12,16 @@ and by ratios, because errors have long tails.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvps.scene import Float
 from solvers.bounded import minimise
+
+SHARPNESS = (8.0, 32.0, 128.0)
+"""Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
 
 SHARPENED = 2.0
 """Largest factor between a lobe's sharpness at first and as solved: candidates lie a factor of four apart, so that lobes meet but never
@@ -33,11 +36,17 @@ CERTAIN = 3.0
 
 @dataclass(frozen=True)
 class Model:
-    """sharpness of the lobes; whether the diffuse term changes at grazing angles; whether surfaces light each other."""
+    """sharpness of the lobes; whether the diffuse term changes at grazing angles; whether surfaces light each other; whether a neural
+    residual takes what is left."""
 
     sharpness: tuple[float, ...] = ()
     grazing: bool = False
     bounce: bool = False
+    neural: bool = False
+
+
+LARGEST = Model(SHARPNESS, True, True, True)
+"""All components there are."""
 
 
 @dataclass(frozen=True)
@@ -51,22 +60,12 @@ class Trial:
     seconds: float
 
 
-Term = tuple[str, Callable[[Model], Model]]
-
-TERMS: tuple[Term, ...] = (
-    ("diffuse term that changes at grazing angles", lambda model: replace(model, grazing=True)),
-    ("inter-reflection", lambda model: replace(model, bounce=True)),
-)
-"""What the law has besides lobes, by name, as functions that add it to a model."""
-
-
-def choose(
-    lobes: Sequence[float], held_out: Callable[[Model], Float], terms: Sequence[Term] = TERMS, sharpen: bool = True
-) -> tuple[Model, list[Trial]]:
+def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = True) -> tuple[Model, list[Trial]]:
     """The model that the object needs, starting from Lambert's, and the account of the trials.
 
-    lobes: sharpness of the candidates, from wide to narrow; sharpen: solve it, which takes longer than all else. held_out gives the errors
-    (n,) of the vertices' held-out samples under a model, NaN where a vertex has none.
+    largest: what may be tried, its lobes from wide to narrow; its neural residual comes later and is not. sharpen: solve the lobes'
+    sharpness, which takes longer than all else. held_out gives the errors (n,) of the vertices' held-out samples under a model, NaN where a
+    vertex has none.
     """
     model = Model()
     errors = held_out(model)
@@ -82,12 +81,14 @@ def choose(
         if judgement.kept:
             model, errors = trial, with_it
 
-    for s in lobes:
+    for s in largest.sharpness:
         try_out(f"lobe of sharpness {s:g}", lambda chosen, s=s: replace(chosen, sharpness=(*chosen.sharpness, s)))  # type: ignore[misc]
     if sharpen and model.sharpness:
         try_out("sharpness of the lobes solved", lambda chosen: sharpened(chosen, errors, held_out))
-    for name, add in terms:
-        try_out(name, add)
+    if largest.grazing:
+        try_out("diffuse term that changes at grazing angles", lambda chosen: replace(chosen, grazing=True))
+    if largest.bounce:
+        try_out("inter-reflection", lambda chosen: replace(chosen, bounce=True))
     return model, trials
 
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mvps.device import Device
     from mvps.joint.refine import Refined, RefineSettings
     from mvps.occupancy import Occupancy, OccupancySettings
+    from mvps.plan import Parts
     from mvps.scene import SignedDistanceGrid, Surface
 
 PRESETS = ("draft", "standard", "fine")
@@ -60,38 +61,6 @@ class Settings:
     seed: int = 0
 
 
-def first_pass(free_lights: bool, final: bool) -> RefineSettings:
-    """Rounds on the hull: lights and normals good enough for Stage I, or all there is (final). Sweeps reach as far as a hull bulges over
-    shallow hollows."""
-    from mvps.joint.refine import RefineSettings, RoundSettings
-
-    rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.5 if final else 3.0, 2.0, 0.4))
-    return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True)
-
-
-def between_passes(free_lights: bool) -> RefineSettings:
-    """A round on Stage I's surface, for the normals and lights from which Stage I is trained again."""
-    from mvps.joint.refine import RefineSettings, RoundSettings
-
-    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights, for_field=True, half=True)
-
-
-def last_pass(preset: str, free_lights: bool) -> RefineSettings:
-    """Rounds after Stage I; edges in pixels, sweeps reach as far as Stage I may be off."""
-    from mvps.joint.refine import RefineSettings, RoundSettings
-
-    first = RoundSettings(1.5, 1.2, 0.3, crease=0.1, fusions=5)
-    rounds = {
-        "standard": (first, replace(first, for_detail=True)),
-        "fine": (
-            RoundSettings(1.0, 1.2, 0.3, fusions=5),
-            RoundSettings(0.8, 1.2, 0.3, crease=0.2, fusions=5),
-            RoundSettings(0.8, 0.6, 0.2, crease=0.1, fusions=5),
-        ),
-    }[preset]
-    return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)
-
-
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
     """What is reconstructed from, and the same views with the lights that were kept back plus the views that were, all their lights
     (None where nothing is).
@@ -122,15 +91,15 @@ def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGri
     return grid, surface
 
 
-def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed: int, progress: Progress) -> Lights:
-    """The given lights, or those of the uncalibrated factorisation."""
+def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed: int, progress: Progress, may_share: bool = True) -> Lights:
+    """The given lights, or those of the uncalibrated factorisation; may_share: of one rig, if that fits."""
     from mvps.calibrate import uncalibrated_lights
 
     with progress.stage("lights") as stage:
         if given is not None:
             stage.status("given with the capture")
             return given
-        calibration = uncalibrated_lights(capture, surface, seed)
+        calibration = uncalibrated_lights(capture, surface, seed, may_share)
         kind = "one rig for all views" if calibration.lights.one_rig else "lights of every view on their own"
         stage.status(f"{kind}; three factors leave {100 * calibration.residual:.1f} % of the images")
         return calibration.lights
@@ -144,7 +113,7 @@ def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySett
 
 
 def shaped(
-    capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, free_lights: bool, progress: Progress
+    capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
 ) -> tuple[Surface, Refined, list[dict[str, float]]]:
     """Stage I and a round of Stage II on its surface in turn; Stage I's last surface, what Stage II last made, and its rounds.
 
@@ -166,7 +135,6 @@ def shaped(
     field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device))
     surface = stage_one(field, rough.maps, plan, progress, words)
     for _ in range(MOST_TURNS):
-        of_turn = between_passes(free_lights)
         refined = stage_two(
             "refinement between", capture, surface, refined.lights, refined.maps, refined.law, of_turn, settings, progress, carried
         )
@@ -271,29 +239,32 @@ def versions() -> dict[str, str]:
     return {"mvps": __version__, "python": platform.python_version(), **{name: version(name) for name in names}}
 
 
-def reconstruct(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
-    """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them."""
+def reconstruct(
+    capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, parts: Parts | None = None
+) -> Reconstruction:
+    """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None."""
     from mvps.device import chosen_device
-    from mvps.joint.photometry import SHARPNESS
     from mvps.joint.refine import POOR_FIT
     from mvps.joint.thinned import thinned
     from mvps.photometric import normal_maps
+    from mvps.plan import Parts, between_passes, first_pass, last_pass
 
+    parts = parts or Parts()
     device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     grid, surface = rough_shape(used, progress)
-    start = first_lights(used, surface, lights, settings.seed, progress)
+    start = first_lights(used, surface, lights, settings.seed, progress, parts.one_rig)
     with progress.stage("photometric stereo"):
         maps = normal_maps(*thinned(used, start), device)
-    law, free = Law(SHARPNESS), lights is None
+    law, free = parts.law(), lights is None
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":
-        refined = stage_two("joint refinement", used, surface, start, maps, law, first_pass(free, True), settings, progress)
+        refined = stage_two("joint refinement", used, surface, start, maps, law, parts.of(first_pass(free, True)), settings, progress)
     else:
-        rough = stage_two("first refinement", used, surface, start, maps, law, first_pass(free, False), settings, progress)
-        surface, between, rounds = shaped(used, grid, rough, settings, free, progress)
+        rough = stage_two("first refinement", used, surface, start, maps, law, parts.of(first_pass(free, False)), settings, progress)
+        surface, between, rounds = shaped(used, grid, rough, settings, parts.of(between_passes(free)), progress)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        plan = last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT)
+        plan = parts.of(last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT))
         carried = between.carried
         start, maps, law = between.lights, between.maps, between.law
         refined = stage_two("joint refinement", used, surface, start, maps, law, plan, settings, progress, carried)

@@ -55,8 +55,10 @@ def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: 
     return Points(position, normalise(mesh_normal), normalise(normal), albedo, weight, confidence, hits.face >= 0, share, code)
 
 
-def shadow_at(caster: RayCaster, points: Points, lights: Float) -> Bool:
-    """(n, lights) True where another part of the mesh hides the light (lights, 3) from the point."""
+def shadow_at(caster: RayCaster, law: Law, points: Points, lights: Float) -> Bool:
+    """(n, lights) True where another part of the mesh hides the light (lights, 3) from the point; nowhere where the law has no shadows."""
+    if not law.shadows:
+        return np.zeros((len(points.position), len(lights)), bool)
     return shadows(caster, points.position, points.mesh_normal, lights)
 
 
@@ -94,12 +96,12 @@ def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: fl
     return shaded
 
 
-def specular_shading(normal: Float, towards: Float, direction: Float, weight: Float, sharpness: Float) -> NDArray[np.float32]:
+def specular_shading(normal: Float, towards: Float, direction: Float, weight: Float, law: Law) -> NDArray[np.float32]:
     """(n, lights, 1 or 3) radiance over intensity of the lobes with weights (n, lobes[, 3]); else as `diffuse_shading`."""
     n, v, light = (torch.tensor(a, dtype=torch.float32) for a in (normal, towards, direction))
     of_channels = torch.tensor(weight if weight.ndim == 3 else weight[..., None], dtype=torch.float32)
     black = torch.zeros(len(n), 1)
-    shaded: NDArray[np.float32] = shade(n, v, light, black, of_channels, Law(tuple(sharpness.tolist()))).numpy()
+    shaded: NDArray[np.float32] = shade(n, v, light, black, of_channels, law).numpy()
     return shaded
 
 
@@ -118,7 +120,7 @@ def photograph(
     """
     points = points_under(caster, material, camera, pixels)
     view = view_directions(camera, points.position)
-    lit = ~shadow_at(caster, points, direction)
+    lit = ~shadow_at(caster, material.law, points, direction)
     image = np.empty((len(pixels), len(direction), 3), np.float32)
     light = torch.tensor(direction, dtype=torch.float32)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))

@@ -264,11 +264,15 @@ class Law:
     sharpness  of the lobes
     grazing    change of the diffuse term when light or view graze, relative: negative under a glossy coat, positive on rough bodies
     bounce     diffuse reflectance in [0, 1] over albedo, which is in units of the photographs: strength of inter-reflection; 0 without
+    microfacet lobes are distributions of microfacets instead of spherical Gaussians
+    shadows    surfaces cast shadows on each other
     """
 
     sharpness: tuple[float, ...]
     grazing: float = 0.0
     bounce: float = 0.0
+    microfacet: bool = False
+    shadows: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,7 +310,7 @@ class Material:
     specular_weight  (V, lobes) or (V, lobes, 3), non-negative
     sharpness        (lobes,) of exp(sharpness * (half . normal - 1)), positive
     confidence       (V,) in the normal (RELIABLE); 0 where no photograph saw the vertex
-    grazing, bounce  as in `Law`
+    grazing, bounce, microfacet, shadows  as in `Law`
     residual         of the reflectance, where albedo and lobes fit badly; None where there is none
     """
 
@@ -317,12 +321,14 @@ class Material:
     confidence: Float
     grazing: float = 0.0
     bounce: float = 0.0
+    microfacet: bool = False
+    shadows: bool = True
     residual: Residual | None = None
 
     @property
     def law(self) -> Law:
         """What all vertices have in common."""
-        return Law(tuple(self.sharpness.tolist()), self.grazing, self.bounce)
+        return Law(tuple(self.sharpness.tolist()), self.grazing, self.bounce, self.microfacet, self.shadows)
 
     def __post_init__(self) -> None:
         n = len(self.albedo)

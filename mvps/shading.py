@@ -4,6 +4,12 @@
     h = (v + l) / |v + l|,   so that   h . n = (n . v + n . l) / sqrt(2 + 2 v . l)
     D(x) = 1 + grazing (1 - x)^p
 
+Distributions of microfacets (GGX: Walter et al. 2007, eq. 33, 1 at its peak) may take the Gaussians' place,
+
+    (1 + sharpness (1 - (h . n)^2) / 4)^-2,   which is alpha^4 / (1 - (1 - alpha^2) (h . n)^2)^2 with alpha^2 = 4 / (4 + sharpness),
+
+of the same peak and the same slope there, but with longer tails.
+
 D is what keeps a diffuse body from being Lambert's: a glossy coat lets less light in and out at grazing angles, a rough body sends more
 back. Product and power follow Schlick 1994 and Burley 2012; p is GRAZING_POWER.
 
@@ -34,22 +40,32 @@ def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor
     return (n_dot_v + n_dot_l) / (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
 
 
-def lobes(h_dot_n: Tensor, sharpness: Tensor) -> Tensor:
-    """(..., lobes) exp(sharpness (h . n - 1)) for h . n (...) and sharpness (lobes,)."""
-    return torch.exp(sharpness * (h_dot_n[..., None] - 1))
+def lobe(h_dot_n: Tensor, sharpness: float, microfacet: bool) -> tuple[Tensor, Tensor | float]:
+    """A lobe's value (...) for h . n (...), and the derivative of its logarithm by h . n."""
+    if not microfacet:
+        return torch.exp(sharpness * (h_dot_n - 1)), sharpness
+    spread = 1 + sharpness / 4 * (1 - h_dot_n**2)
+    return spread**-2, sharpness * h_dot_n / spread
+
+
+def lobes(h_dot_n: Tensor, law: Law) -> Tensor:
+    """(..., lobes) values of the law's lobes for h . n (...)."""
+    values = [lobe(h_dot_n, s, law.microfacet)[0] for s in law.sharpness]
+    return torch.stack(values, -1) if values else h_dot_n.new_zeros(*h_dot_n.shape, 0)
 
 
 @functools.cache
-def returned(sharpness: tuple[float, ...]) -> NDArray[np.float64]:
+def returned(sharpness: tuple[float, ...], microfacet: bool) -> NDArray[np.float64]:
     """(1 + lobes,) what a point returns of light from everywhere, over that of a white diffuse one, by its albedo and weights, seen from
     above: 1 for the albedo, and for a lobe, with u = h.n,
 
-        1/pi int exp(s (h.n - 1)) n.l dl = 8 int exp(s (u - 1)) (2 u^2 - 1) u du from sqrt(1/2) to 1
+        1/pi int lobe(h.n) n.l dl = 8 int lobe(u) (2 u^2 - 1) u du from sqrt(1/2) to 1
     """
     u, weight = np.polynomial.legendre.leggauss(QUADRATURE)
     low = np.sqrt(0.5)
     u = low + (1 - low) * (u + 1) / 2
-    return np.array([1.0, *(4 * (1 - low) * float(weight @ (np.exp(s * (u - 1)) * (2 * u**2 - 1) * u)) for s in sharpness)])
+    values = (lobe(torch.from_numpy(u), s, microfacet)[0].numpy() for s in sharpness)
+    return np.array([1.0, *(4 * (1 - low) * float(weight @ (value * (2 * u**2 - 1) * u)) for value in values)])
 
 
 def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_weight: Tensor, law: Law) -> Tensor:
@@ -63,5 +79,5 @@ def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_
     h_dot_n = half_dot_normal(n_dot_v, n_dot_l, view @ light.T)
     D_l, D_v = (1 + law.grazing * (1 - x.clamp_min(0)) ** GRAZING_POWER for x in (n_dot_l, n_dot_v))
     weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None].expand(-1, -1, 3)
-    specular = lobes(h_dot_n, torch.tensor(law.sharpness, dtype=normal.dtype, device=normal.device)) @ weight
+    specular = lobes(h_dot_n, law) @ weight
     return (albedo[:, None] * (D_l * D_v)[..., None] + specular) * n_dot_l.clamp_min(0)[..., None]

@@ -129,8 +129,8 @@ def pixel_albedo(
         points = points_under(caster, material, view.camera, view.pixels[part])
         towards = view_directions(view.camera, points.position)
         body = diffuse_shading(points.normal, towards, direction, material.grazing)
-        highlight = specular_shading(points.normal, towards, direction, points.specular_weight, material.sharpness)
-        usable: Bool = ~shadow_at(caster, points, direction) & (body > 0) & view.usable()[part] & points.hit[:, None]
+        highlight = specular_shading(points.normal, towards, direction, points.specular_weight, material.law)
+        usable: Bool = ~shadow_at(caster, material.law, points, direction) & (body > 0) & view.usable()[part] & points.hit[:, None]
         # Channels first: numpy's loops are fast along a long last axis.
         diffuse = np.broadcast_to(body, (3, *body.shape))
         if arriving is not None:

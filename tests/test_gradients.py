@@ -27,15 +27,16 @@ SITUATIONS = {
 }
 
 
+@pytest.mark.parametrize("microfacet", [False, True])
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_derivatives_against_finite_differences(situation: str) -> None:
+def test_derivatives_against_finite_differences(situation: str, microfacet: bool) -> None:
     *directions, sharpness = SITUATIONS[situation]
     normal, light = (torch.tensor(v, dtype=torch.float64) for v in directions)
     normal, light = (torch.nn.functional.normalize(v, dim=0)[None] for v in (normal, light))
     view = torch.nn.functional.normalize(torch.tensor([[0.05, 0.1, 1.0]], dtype=torch.float64), dim=1)
     reflectance = torch.tensor([[0.4, 0.3]], dtype=torch.float64)
     intensity, gathered = torch.tensor([1.3], dtype=torch.float64), torch.tensor([[0.2]], dtype=torch.float64)
-    law = Law((sharpness,), -0.3, 0.7)
+    law = Law((sharpness,), -0.3, 0.7, microfacet)
     frame = tangents(normal)
 
     def image(turn: torch.Tensor, values: torch.Tensor, m: torch.Tensor) -> torch.Tensor:

@@ -16,6 +16,7 @@ from mvps.joint.photometry import grey_lights
 from mvps.joint.steps import free_reflectance
 from mvps.joint.trial import held_out_errors
 from mvps.material import SHARPENED, Model, choose
+from mvps.scene import Law
 
 CPU = torch.device("cpu")
 
@@ -30,7 +31,7 @@ def test_a_component_that_helps_stays_and_one_that_does_not_goes() -> None:
     def held_out(model: Model) -> np.ndarray:
         return errors(1.0 - 0.2 * (30.0 in model.sharpness) + 0.001 * model.bounce)
 
-    model, trials = choose((8.0, 30.0), held_out)
+    model, trials = choose(Model((8.0, 30.0), True, True), held_out)
     assert model == Model((30.0,))
     assert [trial.kept for trial in trials] == [False, True, False, False, False]
     assert trials[1].gain == pytest.approx(-np.log(0.8), abs=0.02) and trials[1].noise < 0.02
@@ -42,8 +43,8 @@ def test_vertices_without_held_out_samples_do_not_count() -> None:
         values[::2] = np.nan
         return values
 
-    assert choose((), held_out)[0] == Model((), True, False)
-    assert choose((), lambda _: np.full(3, np.nan))[0] == Model()
+    assert choose(Model((), True, True), held_out)[0] == Model((), True, False)
+    assert choose(Model((), True, True), lambda _: np.full(3, np.nan))[0] == Model()
 
 
 @pytest.mark.parametrize(("best", "found"), [(12.0, 12.0), (100.0, 8 * SHARPENED)])
@@ -51,7 +52,7 @@ def test_sharpness_is_solved_within_its_bounds(best: float, found: float) -> Non
     def held_out(model: Model) -> np.ndarray:
         return errors(1.0 + float(np.log(model.sharpness[0] / best) ** 2) if model.sharpness else 9.0)
 
-    model, trials = choose((8.0,), held_out, ())
+    model, trials = choose(Model((8.0,)), held_out)
     assert model.sharpness[0] == pytest.approx(found, rel=0.15) and [trial.kept for trial in trials] == [True, True]
 
 
@@ -77,5 +78,5 @@ def test_lobes_are_kept_on_a_glossy_ball_alone(scene: SphereScene, glossy: bool)
     tie = free_reflectance(normal, 0.05, 1)
     rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
     views, start, tie, patches = in_patches(r.surface, views, start, tie)
-    model, _ = choose((12.0, 60.0), lambda m: held_out_errors(views, start, lights, tie, patches, rotations, m), ())
+    model, _ = choose(Model((12.0, 60.0)), lambda m: held_out_errors(views, start, lights, tie, patches, rotations, Law(()), m))
     assert (len(model.sharpness) > 0) == glossy

@@ -3,7 +3,7 @@
 import torch
 
 from mvps.scene import Law
-from mvps.shading import half_dot_normal, lobes, shade
+from mvps.shading import half_dot_normal, lobe, lobes, shade
 
 N = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
 
@@ -49,9 +49,15 @@ def test_half_vector_against_its_definition() -> None:
     view, light = unit(0.2, -0.5, 1), unit(-0.6, 0.3, 0.8)
     half = torch.nn.functional.normalize(view + light, dim=1)
     assert torch.allclose(half_dot_normal((N * view).sum(-1, keepdim=True), N @ light.T, view @ light.T), N @ half.T)
-    assert torch.allclose(
-        lobes(torch.ones(3, dtype=torch.float64), torch.tensor([5.0, 50.0], dtype=torch.float64)), torch.ones(3, 2, dtype=torch.float64)
-    )
+    assert torch.equal(lobes(torch.ones(3), Law((5.0, 50.0))), torch.ones(3, 2))
+
+
+def test_microfacets_have_the_peak_and_slope_of_a_gaussian_and_longer_tails() -> None:
+    half = torch.tensor([1.0, 0.98, 0.8], dtype=torch.float64)
+    (gaussian, _), (ggx, steepness) = (lobe(half, 40.0, microfacet) for microfacet in (False, True))
+    assert ggx[0] == 1 and steepness[0] == 40 and (ggx[1:] > gaussian[1:]).all()
+    alpha = (4 / 44) ** 0.5
+    assert torch.allclose(ggx, alpha**4 / (half**2 * (alpha**2 - 1) + 1) ** 2)
 
 
 def test_gradients_against_finite_differences() -> None:

@@ -30,7 +30,7 @@ from torch.nn.utils.rnn import pad_sequence
 from mvps.cores import on_cores
 from mvps.joint.observe import ViewSamples
 from mvps.scene import GRAZING_POWER, Law
-from mvps.shading import PARALLEL, half_dot_normal
+from mvps.shading import PARALLEL, half_dot_normal, lobe
 from solvers.low_rank import CAUCHY_95
 
 WORKERS = 2
@@ -191,11 +191,11 @@ def evaluate(
     slope = torch.zeros_like(q)
     basis = [q * (D_l * D_v) + (0 if gathered is None else law.bounce * intensity * gathered)]
     for k, s in enumerate(law.sharpness):
-        lobe = torch.exp(s * (half - 1))
-        weighted = lobe * reflectance[..., k + 1, None]
+        value, steepness = lobe(half, s, law.microfacet)
+        weighted = value * reflectance[..., k + 1, None]
         total = total + weighted
-        slope = slope + s * weighted
-        basis.append(q * lobe)
+        slope = slope + steepness * weighted
+        basis.append(q * value)
     predicted = q * total + law.bounce * indirect
     of_light, of_view = albedo * law.grazing * slope_l * D_v, albedo * law.grazing * D_l * slope_v
     return Shaded(lit, n_dot_l, half, c, basis, total, slope, of_light, of_view, grazing, indirect, predicted)

@@ -93,14 +93,14 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     # With the light at the camera no visible vertex is in shadow.
     from_camera = [np.tile(-view.camera.rotation[2], (len(view.lights), 1)) for view in capture.views]
     white = [np.ones_like(d) for d in from_camera]
-    views = observe(capture, surface, Lights(tuple(from_camera), tuple(white), one_rig), device)
+    views = observe(capture, surface, Lights(tuple(from_camera), tuple(white), one_rig), device, shadows=material.law.shadows)
     vertices = _vertices(material, device)
     products = _lambertian(views, vertices, rotations, one_rig)
     grey = [_from_product(m, rotation) for m, rotation in zip(products, rotations, strict=True)]
     sources = coarse_sources(surface, material.albedo.mean(1)) if material.bounce else None
     for _ in range(2):
         lights = _as_lights(grey, [channel_ratio(e) for e in white], one_rig)
-        views = observe(capture, surface, lights, device)
+        views = observe(capture, surface, lights, device, shadows=material.law.shadows)
         if sources is not None:
             views = with_gathered(views, surface, sources, material.bounce, lights)
         for _ in range(STEPS):

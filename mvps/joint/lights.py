@@ -240,7 +240,7 @@ def light_step(
     """
     layout = _layout(lights, one_rig, free[0])
     step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free[1:])
-    reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness))).median())
+    reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))).median())
     law = _stepped_law(law, step[-OF_LAW:], reflected)
     if not layout.lights:
         return lights, law

@@ -132,8 +132,11 @@ def visible_in(capture: Capture, surface: Surface) -> list[tuple[Int, Float]]:
     return [_pairs(view, caster)[:2] for view in capture.views]
 
 
-def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None) -> list[ViewSamples]:
-    """The samples of all views on the vertices of `surface`, or on those `among` (V,); visibility and cast shadows are traced anew."""
+def observe(
+    capture: Capture, surface: Surface, lights: Lights, device: torch.device, among: Bool | None = None, shadows: bool = True
+) -> list[ViewSamples]:
+    """The samples of all views on the vertices of `surface`, or on those `among` (V,); visibility is traced anew, and cast shadows if
+    the law has them."""
     caster = ray_caster(surface)
 
     def one(i: int) -> ViewSamples:
@@ -141,13 +144,14 @@ def observe(capture: Capture, surface: Surface, lights: Lights, device: torch.de
         vertex, pair, positions, weights = _pairs(view, caster, among)
         towards = view_directions(view.camera, surface.vertices[vertex])
         image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
-        shadow = cast_shadow(caster, vertex, lights.direction[i])
+        if shadows:
+            usable &= ~cast_shadow(caster, vertex, lights.direction[i])
         return ViewSamples(
             torch.from_numpy(vertex).to(device),
             torch.from_numpy(towards.astype(np.float32)).to(device),
             torch.from_numpy(pair.astype(np.float32)).to(device),
             torch.from_numpy(image).to(device),
-            torch.from_numpy(usable & ~shadow).to(device),
+            torch.from_numpy(usable).to(device),
         )
 
     return on_cores(one, range(len(capture.views)))

@@ -31,9 +31,6 @@ from mvps.material import Model, Trial, choose
 from mvps.mesh import angles_deg, edges, lengths, mean_edge_length, normalise, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 
-SHARPNESS = (8.0, 32.0, 128.0)
-"""Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
-
 LIGHT_VERTICES, TRIAL_VERTICES = 4000, 1000
 """Vertices, in patches, that stand for all when lights are solved, and when components of the model are tried."""
 
@@ -56,11 +53,11 @@ class State:
     lights: Lights
     maps: tuple[NormalMap, ...]
     law: Law
+    model: Model
     vertices: Vertices | None = None
     coarse: Gather | None = None
     views: list[ViewSamples] = field(default_factory=list)
     under: tuple[Capture, Lights] | None = None
-    model: Model = field(default_factory=lambda: Model(SHARPNESS, True, True))
     trials: list[Trial] = field(default_factory=list)
 
 
@@ -139,9 +136,10 @@ def _choose_model(
     few, part, tie = subset(few, start, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
     lights, law = grey_lights(state.lights, patches.vertex.device), state.law
-    errors = partial(held_out_errors, few, part, lights, tie, patches, rotations)
-    state.model, state.trials = choose(law.sharpness, errors, sharpen=sharpen)
-    state.law = Law(state.model.sharpness, law.grazing * state.model.grazing, law.bounce * state.model.bounce)
+    errors = partial(held_out_errors, few, part, lights, tie, patches, rotations, law)
+    state.model, state.trials = choose(state.model, errors, sharpen)
+    kept = state.model
+    state.law = replace(law, sharpness=kept.sharpness, grazing=law.grazing * kept.grazing, bounce=law.bounce * kept.bounce)
     return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
 
 
@@ -224,7 +222,7 @@ def photometric_round(
     device = task.device
 
     part, part_lights = thinned(capture, state.lights)
-    state.views = observe(part, state.surface, part_lights, device)
+    state.views = observe(part, state.surface, part_lights, device, shadows=state.law.shadows)
     mesh_normal = vertex_normals(state.surface)
     vertices = _started(state, part, part_lights, mesh_normal, carried, device)
     seen = torch.cat([samples.vertex for samples in state.views]).unique().cpu().numpy()
@@ -233,7 +231,7 @@ def photometric_round(
     if part is not capture:
         among = np.zeros(len(mesh_normal), bool)
         among[patches.vertex.cpu().numpy()] = True
-        few = observe(capture, state.surface, state.lights, device, among)
+        few = observe(capture, state.surface, state.lights, device, among, state.law.shadows)
     if state.coarse is None:
         state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
 
@@ -317,4 +315,4 @@ def material_of(state: State, albedo: Float) -> Material:
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
     certain = confidence(vertices).double().cpu().numpy()
     certain, law = np.where(known, certain, 0), state.law
-    return Material(normal, albedo[nearest], weight, np.array(law.sharpness), certain, law.grazing, law.bounce)
+    return Material(normal, albedo[nearest], weight, np.array(law.sharpness), certain, law.grazing, law.bounce, law.microfacet, law.shadows)

@@ -76,7 +76,7 @@ def pixel_normals(
     chosen = view.every_other if every_other else np.arange(len(view.pixels))
     points = points_under(caster, material, view.camera, view.pixels[chosen])
     hit = np.flatnonzero(points.hit)
-    rows, shadow = chosen[hit], shadow_at(caster, points, direction)[hit]
+    rows, shadow = chosen[hit], shadow_at(caster, material.law, points, direction)[hit]
     samples = _samples(view, points.position[hit], shadow, intensity, rows, device)
     if sources is not None:
         G = at(sources, gathered(sources, direction, material.bounce), points.position[hit], points.mesh_normal[hit])

@@ -38,7 +38,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import fuse, with_masks
-from mvps.material import Trial
+from mvps.material import LARGEST, Model, Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
@@ -70,7 +70,8 @@ class RoundSettings:
     """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
     lights and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge
     before it is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY); fusions: faces turn and move, so
-    that other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows."""
+    that other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows; without any the surface
+    stays."""
 
     edge: float
     reach: float
@@ -91,7 +92,7 @@ class RefineSettings:
     held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
     last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
     the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels and more, or for
-    Stage I, which draws fewer rays than there are pixels."""
+    Stage I, which draws fewer rays than there are pixels; model: all that the reflectance may have."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
@@ -99,6 +100,7 @@ class RefineSettings:
     in_full: bool = False
     for_field: bool = False
     half: bool = False
+    model: Model = LARGEST
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +179,7 @@ def refine(
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
-    state = State(surface, lights, maps, law)
+    state = State(surface, lights, maps, law, settings.model)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
     while pending:
@@ -187,7 +189,7 @@ def refine(
         if creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
-        leaves_surface = settings.for_field and not pending
+        leaves_surface = (settings.for_field and not pending) or not round_settings.fusions
         if round_settings.photometric:
             every_light = settings.in_full and not pending
             task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device)
@@ -206,11 +208,12 @@ def refine(
         before = round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
-    return replace(_finished(state, settings.final, account, device, generator), carried=carried)
+    return replace(_finished(state, settings, account, device, generator), carried=carried)
 
 
-def _coloured(state: State, device: torch.device, generator: np.random.Generator) -> Material:
-    """The material with albedo and lobes in the photographs' colours, a neural residual where that helps, and the stated error."""
+def _coloured(state: State, neural: bool, device: torch.device, generator: np.random.Generator) -> Material:
+    """The material with albedo and lobes in the photographs' colours, a neural residual, if allowed, where that helps, and the stated
+    error."""
     assert state.vertices is not None and state.under is not None
     photographs, lights = state.under
     ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
@@ -220,17 +223,23 @@ def _coloured(state: State, device: torch.device, generator: np.random.Generator
         state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
         coloured_lobes = state.trials[-1].kept
     albedo, tint = colours(observed, ratios, coloured_lobes)
-    trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
-    state.trials.append(trial)
+    residual = None
+    if neural:
+        trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
+        state.trials.append(trial)
     certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE), 0)
     material = replace(material_of(state, albedo), confidence=certain, residual=residual)
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 
 
-def _finished(state: State, final: bool, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator) -> Refined:
-    """What the rounds came to; in colour if final."""
+def _finished(
+    state: State, settings: RefineSettings, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
+) -> Refined:
+    """What the rounds came to; in colour if that is final."""
     assert state.vertices is not None
-    material = _coloured(state, device, generator) if final else material_of(state, grey_albedo(state.vertices))
+    material = (
+        _coloured(state, settings.model.neural, device, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
+    )
     status, text = _verdict(account)
     return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
 

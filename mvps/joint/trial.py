@@ -41,18 +41,20 @@ def held_out_errors(
     anchor: Anchor,
     patches: Patches,
     rotations: list[Tensor],
+    law: Law,
     model: Model,
 ) -> Float:
     """(V,) mean absolute error of the held-out samples over their mean value, NaN for a vertex without any.
 
-    start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope.
+    start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope. law: its
+    lobes' kind; the model says the rest.
     """
     fitted, kept = parted(views)
     unknowns = 1 + len(model.sharpness)
     reflectance = torch.cat([start.reflectance[:, :1], start.reflectance.new_zeros(len(start.normal), unknowns - 1)], 1)
     state = Vertices(start.normal, reflectance, start.scale)
     free = replace(anchor, reflectance=torch.zeros_like(reflectance), reflectance_sigma=torch.full_like(reflectance, torch.inf))
-    law = Law(model.sharpness)
+    law = replace(law, sharpness=model.sharpness, grazing=0.0, bounce=0.0)
     for _ in range(VERTEX_STEPS):
         state = vertex_step(fitted, state, lights, law, free, patches=patches)
     for _ in range(LAW_STEPS if model.grazing or model.bounce else 0):

@@ -48,7 +48,7 @@ def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Re
     dark = replace(material, albedo=np.zeros_like(material.albedo))
     specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity)[:, 0]
     points = points_under(caster, material, view.camera, view.pixels)
-    cast = shadow_at(caster, points, direction)[:, 0]
+    cast = shadow_at(caster, material.law, points, direction)[:, 0]
     attached = points.normal @ direction[0] <= 0
     white = float(np.percentile(measured, 99.5)) or 1.0
     error = np.abs(measured - rendered).mean(1) / white

@@ -1,0 +1,67 @@
+"""What Stage II does when: its rounds by preset, and which parts of the method take part.
+
+Lengths of rounds are in pixels. Ablations leave parts out; nothing else does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mvps.joint.refine import RefineSettings, RoundSettings
+from mvps.material import LARGEST, Model
+from mvps.scene import Law
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of the method that take part.
+
+    model        all that the reflectance may have
+    microfacet   lobes are distributions of microfacets (shading.py)
+    shadows      cast shadows are traced
+    one_rig      lights that stand still with the camera are looked for
+    free_lights  lights are refined after their first estimate
+    moves        vertices move, to where views agree
+    """
+
+    model: Model = LARGEST
+    microfacet: bool = False
+    shadows: bool = True
+    one_rig: bool = True
+    free_lights: bool = True
+    moves: bool = True
+
+    def law(self) -> Law:
+        """The image model to start with."""
+        return Law(self.model.sharpness, microfacet=self.microfacet, shadows=self.shadows)
+
+    def of(self, plan: RefineSettings) -> RefineSettings:
+        """The plan with these parts alone."""
+        rounds = plan.rounds if self.moves else tuple(replace(one, fusions=0) for one in plan.rounds)
+        return replace(plan, rounds=rounds, free_lights=plan.free_lights and self.free_lights, model=self.model)
+
+
+def first_pass(free_lights: bool, final: bool) -> RefineSettings:
+    """Rounds on the hull: lights and normals good enough for Stage I, or all there is (final). Sweeps reach as far as a hull bulges over
+    shallow hollows."""
+    rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.5 if final else 3.0, 2.0, 0.4))
+    return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True)
+
+
+def between_passes(free_lights: bool) -> RefineSettings:
+    """A round on Stage I's surface, for the normals and lights from which Stage I is trained again."""
+    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights, for_field=True, half=True)
+
+
+def last_pass(preset: str, free_lights: bool) -> RefineSettings:
+    """Rounds after Stage I; sweeps reach as far as Stage I may be off."""
+    first = RoundSettings(1.5, 1.2, 0.3, crease=0.1, fusions=5)
+    rounds = {
+        "standard": (first, replace(first, for_detail=True)),
+        "fine": (
+            RoundSettings(1.0, 1.2, 0.3, fusions=5),
+            RoundSettings(0.8, 1.2, 0.3, crease=0.2, fusions=5),
+            RoundSettings(0.8, 0.6, 0.2, crease=0.1, fusions=5),
+        ),
+    }[preset]
+    return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)
