@@ -5,8 +5,9 @@
     lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
-                             grazing, bounce (numbers); with a neural residual also residual_share (V,), residual_code (V, codes),
-                             residual_weight_K (out, in) and residual_bias_K (out,) of its layers K = 0, 1, ...
+                             grazing, bounce (numbers), microfacet, shadows (truth values); with a neural residual also
+                             residual_share (V,), residual_code (V, codes), residual_weight_K (out, in) and residual_bias_K (out,) of its
+                             layers K = 0, 1, ...
     normals/NAME.npy, .png   (height, width, 3) float32 world frame, NaN outside the mask; the picture shows (normal + 1) / 2
     report.html              where one is given
     metrics.json, settings.json

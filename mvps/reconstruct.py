@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from mvps.joint.refine import Refined, RefineSettings
     from mvps.occupancy import Occupancy, OccupancySettings
     from mvps.plan import Parts
-    from mvps.scene import SignedDistanceGrid, Surface
+    from mvps.scene import Material, SignedDistanceGrid, Surface
 
 PRESETS = ("draft", "standard", "fine")
 
@@ -173,32 +173,34 @@ def stage_two(
     return refined
 
 
-def all_lights(capture: Capture, used: Capture, held: Capture | None, refined: Refined, device: Device) -> Lights:
-    """Lights of every photograph of `capture`, in its order: refined where used, else carried over from the rig or fitted."""
+def all_lights(
+    capture: Capture, used: Capture, held: Capture | None, lights: Lights, surface: Surface, material: Material, device: Device
+) -> Lights:
+    """Lights of every photograph of `capture`, in its order: `lights` where used, else carried over from the rig or fitted."""
     import numpy as np
 
     from mvps.joint.held_out import carried_over, fit_lights
 
     known: dict[tuple[str, int], tuple[Any, Any]] = {}
-    for view, directions, intensities in zip(used.views, refined.lights.direction, refined.lights.intensity, strict=True):
+    for view, directions, intensities in zip(used.views, lights.direction, lights.intensity, strict=True):
         known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
-    if held is not None and refined.lights.one_rig:
+    if held is not None and lights.one_rig:
         rotations = [view.camera.rotation for view in used.views]
         for view in held.views:
-            directions, intensities = carried_over(refined.lights, rotations, view.camera.rotation)
+            directions, intensities = carried_over(lights, rotations, view.camera.rotation)
             rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
             known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
     if held is not None:
         unknown = {view.name: [n for n in view.lights if (view.name, n) not in known] for view in held.views}
         rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
         if rest is not None:
-            shared = refined.lights.one_rig and len({view.lights for view in rest.views}) == 1
-            fitted = fit_lights(rest, refined.surface, refined.material, shared, device)
+            shared = lights.one_rig and len({view.lights for view in rest.views}) == 1
+            fitted = fit_lights(rest, surface, material, shared, device)
             for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
                 known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
     direction = tuple(np.array([known[view.name, n][0] for n in view.lights]) for view in capture.views)
     intensity = tuple(np.array([known[view.name, n][1] for n in view.lights]) for view in capture.views)
-    return Lights(direction, intensity, refined.lights.one_rig)
+    return Lights(direction, intensity, lights.one_rig)
 
 
 def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[Any, ...]:
@@ -269,7 +271,7 @@ def reconstruct(
         start, maps, law = between.lights, between.maps, between.law
         refined = stage_two("joint refinement", used, surface, start, maps, law, plan, settings, progress, carried)
     with progress.stage("lights and normals of all views"):
-        complete = all_lights(capture, used, held, refined, device)
+        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
         pictures = normal_pictures(capture, used, refined)
     metrics = {"stages": progress.stages, "rounds": rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
     metrics["model"] = {

@@ -1,0 +1,84 @@
+"""The command line: python -m mvps.compare."""
+
+from __future__ import annotations
+
+from argparse import SUPPRESS, ArgumentTypeError
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mvps.command import parse, parser, run
+from mvps.methods import METHODS, OPTIONS, listed_methods
+from mvps.progress import Progress
+from mvps.scene import CaptureError
+
+
+def method_list(text: str) -> tuple[str, ...]:
+    """Names of methods, separated by commas."""
+    names = tuple(word.strip() for word in text.split(","))
+    for name in names:
+        if name not in METHODS:
+            raise ArgumentTypeError(f"wanted some of {', '.join(METHODS)}, given {name!r}")
+    return tuple(dict.fromkeys(names))
+
+
+def checked(kind: Callable[[str], Any]) -> Callable[[str], str]:
+    """A type for an option whose text is passed on as it is, once `kind` has not complained of it."""
+
+    def text_of(text: str) -> str:
+        kind(text)
+        return text
+
+    text_of.__name__ = kind.__name__
+    return text_of
+
+
+def write_pictures(capture: Path, methods: Sequence[str], out: Path) -> None:
+    """normals.png of the first view with true normals; nothing where there is none."""
+    from mvps.compare.pictures import cropped, side_by_side
+    from mvps.export import read_reconstruction
+    from mvps.load import read_truth
+    from mvps.texture import png_bytes
+
+    truth = read_truth(capture).normals
+    found = {name: read_reconstruction(out / name) for name in methods}
+    common = [view for view in truth if all(view in result.views for result in found.values())]
+    if not found or not common:
+        return
+    view = common[0]
+    box = cropped(truth[view])
+    maps = {name: result.normal_maps[result.views.index(view)][box] for name, result in found.items()}
+    (out / "normals.png").write_bytes(png_bytes(side_by_side(truth[view][box], maps)))
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    made = parser(
+        "mvps.compare",
+        "Run methods on a capture, each in a process of its own, and set them side by side: a table (DIR/table.md, .csv, .json),\n"
+        "pictures of normals and their errors, the meshes (DIR/METHOD). What DIR holds already is not run again.\n\n" + listed_methods(),
+    )
+    made.add_argument("capture", type=Path, help="folder in the DiLiGenT-MV layout")
+    made.add_argument("--methods", type=method_list, default="ours,ours-draft,hull", metavar="NAME,NAME", help="some of the above")
+    made.add_argument("--out", type=Path, required=True, help="folder of the comparison; what it holds is kept")
+    for name, (kind, _, words) in OPTIONS.items():
+        made.add_argument(f"--{name}", type=checked(kind), default=SUPPRESS, help=words)
+    given = parse(made, argv)
+    from mvps.compare.running import run_all
+    from mvps.compare.tables import as_csv, as_markdown, as_text, rows
+
+    texts = {name: getattr(given, name.replace("-", "_"), None) for name in OPTIONS}
+    options = [f"--{name}={text}" for name, text in texts.items() if text is not None]
+    runs = run_all(given.capture, given.methods, options, given.out, Progress())
+    chosen = [runs[name] for name in given.methods]
+    if all(one.failed for one in chosen):
+        raise CaptureError(chosen[0].failed)
+    lines = rows(chosen)
+    (given.out / "table.md").write_text(as_markdown(lines) + "\n", encoding="utf-8")
+    (given.out / "table.csv").write_text(as_csv(lines), encoding="utf-8")
+    write_pictures(given.capture, [one.method for one in chosen if not one.failed], given.out)
+    print(as_text(lines))
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(main))

@@ -1,0 +1,90 @@
+"""Every method in a process of its own, so that its time and its largest memory are its own. What has run with the same options stays.
+
+Seconds are of the whole process, imports and reading included; memory is its largest resident set.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from mvps.evaluate import evaluate_result, write_json
+from mvps.load import read_truth
+from mvps.progress import Progress
+from mvps.scene import CaptureError
+
+RUNS = "runs.json"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What came of a method. options: of mvps.methods, by which a run is known; failed: why there is no result, else empty; status: of the
+    result; errors: by the names of mvps.measures, where the capture has truth."""
+
+    method: str
+    options: tuple[str, ...]
+    seconds: float = 0.0
+    peak_memory_mb: float = 0.0
+    failed: str = ""
+    status: str = ""
+    errors: dict[str, float] = field(default_factory=dict)
+
+
+def known_runs(out: Path) -> dict[str, Run]:
+    """The runs in an earlier comparison's folder by method; none where it is new. CaptureError where its record is damaged."""
+    path = out / RUNS
+    if not path.exists():
+        return {}
+    try:
+        records = json.loads(path.read_text(encoding="utf-8"))
+        return {name: Run(**{**record, "options": tuple(record["options"])}) for name, record in records.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CaptureError(f"{path}: wanted the record of a comparison, given something else ({error}); give another --out") from error
+
+
+def run_all(capture: Path, methods: Sequence[str], options: Sequence[str], out: Path, progress: Progress) -> dict[str, Run]:
+    """Runs the methods that have not run with these options yet, evaluates them, and keeps the record in `out`."""
+    if out.exists() and any(out.iterdir()) and not (out / RUNS).exists():
+        raise CaptureError(f"{out}: wanted a new or empty folder or an earlier comparison, given a folder with other files")
+    out.mkdir(parents=True, exist_ok=True)
+    runs = known_runs(out)
+    for name in methods:
+        known = runs.get(name)
+        if known is None or known.options != tuple(options) or known.failed or not (out / name / "settings.json").exists():
+            with progress.stage(name) as stage:
+                runs[name] = _run(capture, name, options, out / name)
+                stage.status(runs[name].failed or runs[name].status)
+            write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
+    return runs
+
+
+def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
+    """One method and its errors. KeyboardInterrupt where the user interrupts it."""
+    command = [sys.executable, "-m", "mvps.methods", str(capture), "--method", name, "--out", str(folder), *options]
+    start = time.perf_counter()
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as complaints:
+        process = subprocess.Popen(command, stderr=complaints)
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
+        process.returncode = code
+        complaints.seek(0)
+        said = complaints.read().strip()
+    if code == 130:
+        raise KeyboardInterrupt
+    if code == 2:
+        return Run(name, tuple(options), seconds, failed=said.splitlines()[-1].removeprefix("mvps: "))
+    if code:
+        raise RuntimeError(f"{' '.join(command)}: exit code {code}\n{said}")
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    truth = read_truth(capture)
+    known = truth.surface is not None or truth.normals or truth.direction
+    errors = evaluate_result(folder, capture) if known else {}
+    # Linux counts in units of 1024 bytes.
+    return Run(name, tuple(options), seconds, usage.ru_maxrss * 1024 / 1e6, "", metrics["status"]["name"], errors)

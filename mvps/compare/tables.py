@@ -1,0 +1,66 @@
+"""Runs as a table: text, Markdown, CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from mvps.compare.running import Run
+
+
+class Column(NamedTuple):
+    """Title, key of the errors, factor, decimal digits."""
+
+    title: str
+    key: str
+    factor: float
+    digits: int
+
+
+COLUMNS = (
+    Column("lights deg", "light_error_deg", 1, 2),
+    Column("intensities %", "intensity_error", 100, 2),
+    Column("normal map deg", "map_normal_error_deg", 1, 2),
+    Column("mesh normal deg", "mesh_normal_error_deg", 1, 2),
+    Column("Chamfer px", "chamfer_px", 1, 3),
+    Column("Chamfer mm", "chamfer_mm", 1, 3),
+    Column("F@0.5 mm", "f_score_0_5_mm", 1, 3),
+    Column("held-out view normals deg", "mesh_held_out_normal_error_deg", 1, 2),
+    Column("held-out views PSNR dB", "held_out_views_psnr_db", 1, 1),
+)
+"""Errors of mvps.measures (first hits of the capture's cameras; millimetres are the capture's units)."""
+
+
+def rows(runs: Sequence[Run]) -> list[list[str]]:
+    """Title row and one row a run; columns that no run has are left out."""
+    kept = [column for column in COLUMNS if any(column.key in run.errors for run in runs)]
+    lines = [["method", *(column.title for column in kept), "s", "peak MB", "status"]]
+    for run in runs:
+        figures = [f"{c.factor * run.errors[c.key]:.{c.digits}f}" if c.key in run.errors else "-" for c in kept]
+        cost = ["-", "-"] if run.failed else [f"{run.seconds:.0f}", f"{run.peak_memory_mb:.0f}"]
+        lines.append([run.method, *figures, *cost, f"did not run: {run.failed}" if run.failed else run.status])
+    return lines
+
+
+def as_text(lines: list[list[str]]) -> str:
+    """Columns of equal width."""
+    width = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
+    return "\n".join(
+        "  ".join(cell.ljust(w) if k in (0, len(width) - 1) else cell.rjust(w) for k, (cell, w) in enumerate(zip(line, width, strict=True)))
+        for line in lines
+    )
+
+
+def as_markdown(lines: list[list[str]]) -> str:
+    """A Markdown table."""
+    head, *body = lines
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *body))
+
+
+def as_csv(lines: list[list[str]]) -> str:
+    """Comma-separated values."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()

@@ -1,0 +1,153 @@
+"""python -m mvps.methods CAPTURE --method NAME --out RESULT: one method of those that mvps.compare sets side by side.
+
+Ours in its presets; ours with a part left out (ablations: mvps.plan.Parts); what came before a part (hull, Stage I); published methods
+written from their papers (mvps.baselines). Every one takes the same capture and writes the same kind of result folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mvps.command import lights_argument, number_list, parse, parser, run
+from mvps.progress import Progress
+from mvps.reconstruct import Settings, parted
+from mvps.scene import Capture, Lights, Reconstruction
+
+if TYPE_CHECKING:
+    from mvps.plan import Parts
+
+Run = Callable[[Capture, Settings, Lights | None, Progress], Reconstruction]
+"""From a capture (held-out photographs included), settings and calibrated lights of the photographs used, if they were asked for."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method: what it is, in words; how it runs; whether it wants the capture's calibrated lights."""
+
+    words: str
+    run: Run
+    calibrated: bool = False
+
+
+def _ours(preset: str) -> Run:
+    def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+        from mvps.reconstruct import reconstruct
+
+        return reconstruct(capture, replace(settings, preset=preset), lights, progress)
+
+    return run_
+
+
+def _ablation(parts: Callable[[], Parts]) -> Run:
+    """Ours, standard, with these parts alone; a function makes them, for their module takes a second to import."""
+
+    def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+        from mvps.reconstruct import reconstruct
+
+        return reconstruct(capture, settings, lights, progress, parts())
+
+    return run_
+
+
+def _lambert() -> Parts:
+    from mvps.material import Model
+    from mvps.plan import Parts
+
+    return Parts(model=Model())
+
+
+def _no_neural() -> Parts:
+    from mvps.material import LARGEST
+    from mvps.plan import Parts
+
+    return Parts(model=replace(LARGEST, neural=False))
+
+
+def _without(**parts: bool) -> Callable[[], Parts]:
+    def made() -> Parts:
+        from mvps.plan import Parts
+
+        return Parts(**parts)  # type: ignore[arg-type]
+
+    return made
+
+
+def _hull(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    from mvps.stages import hull
+
+    return hull(capture, settings, lights, progress)
+
+
+def _stage1(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    from mvps.stages import stage1
+
+    return stage1(capture, settings, lights, progress)
+
+
+METHODS = {
+    "ours": Method("all of the method, preset standard", _ours("standard")),
+    "ours-draft": Method("preset draft: no Stage I, coarser mesh", _ours("draft")),
+    "ours-fine": Method("preset fine: finer mesh", _ours("fine")),
+    "hull": Method("the visual hull, lights of the factorisation", _hull),
+    "stage1": Method("Stage I alone: normal-regularised occupancy field", _stage1),
+    "lambert": Method("ours with albedo alone: no lobes, no inter-reflection, no neural residual", _ablation(_lambert)),
+    "microfacet": Method("ours with GGX lobes in place of spherical Gaussians", _ablation(_without(microfacet=True))),
+    "fixed-light": Method("ours with the lights of the factorisation, never refined", _ablation(_without(free_lights=False))),
+    "no-visibility": Method("ours without cast shadows", _ablation(_without(shadows=False))),
+    "per-view-lights": Method("ours with the lights of every view on their own", _ablation(_without(one_rig=False))),
+    "no-vertex-step": Method("ours, but Stage II leaves the vertices where Stage I put them", _ablation(_without(moves=False))),
+    "no-neural": Method("ours without a neural residual", _ablation(_no_neural)),
+    "calibrated": Method("ours with the true lights", _ours("standard"), calibrated=True),
+}
+"""By the name that --method and --methods take."""
+
+
+def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
+    """Read the capture, run the method and write its result folder. CaptureError where the method cannot run on it."""
+    from mvps.export import write_reconstruction
+    from mvps.load import read_calibrated_lights, read_capture
+
+    method, progress = METHODS[name], Progress()
+    with progress.stage("load"):
+        capture = read_capture(path, settings.views or None, settings.lights or None)
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    calibrated = settings.calibrated_lights or method.calibrated
+    lights = read_calibrated_lights(path, used) if calibrated else None
+    made = method.run(capture, replace(settings, calibrated_lights=calibrated), lights, progress)
+    metrics = {**made.metrics, "stages": progress.stages}
+    write_reconstruction(replace(made, metrics=metrics, settings={**made.settings, "method": name}), out)
+
+
+OPTIONS: dict[str, tuple[Callable[[str], Any], Any, str]] = {
+    "views": (number_list, (), "numbers of the views to read, counted from 1; all if not given"),
+    "lights": (lights_argument, (), "numbers of the lights, or a JSON file with a list per view"),
+    "hold-out-views": (number_list, (), "views kept back for evaluation"),
+    "device": (str, "auto", "where torch computes: auto, cpu or cuda"),
+    "seed": (int, 0, "of all random draws"),
+}
+"""What every method takes: type, default, help by name."""
+
+
+def listed_methods() -> str:
+    """The methods, one a line."""
+    return "\n".join(f"  {name:16} {method.words}" for name, method in METHODS.items())
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    made = parser("mvps.methods", f"Run one method on a capture and write its result folder, without textures.\n\n{listed_methods()}")
+    made.add_argument("capture", type=Path, help="folder in the DiLiGenT-MV layout")
+    made.add_argument("--method", choices=METHODS, required=True, metavar="NAME", help="one of the above")
+    made.add_argument("--out", type=Path, required=True, help="result folder; an earlier result there is replaced")
+    for name, (kind, default, words) in OPTIONS.items():
+        made.add_argument(f"--{name}", type=kind, default=default, help=words)
+    given = parse(made, argv)
+    chosen = {name.replace("-", "_"): getattr(given, name.replace("-", "_")) for name in OPTIONS}
+    run_method(given.capture, given.method, Settings(str(given.capture), **chosen), given.out)
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(main))

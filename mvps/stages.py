@@ -1,0 +1,64 @@
+"""Results of single stages, for comparison: the visual hull, and Stage I, each with Lambert's albedo under the lights of its time."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from mvps.device import chosen_device
+from mvps.joint.lambertian import lambertian
+from mvps.joint.thinned import thinned
+from mvps.measures import mesh_normals
+from mvps.occupancy import Occupancy, OccupancySettings
+from mvps.photometric import normal_maps
+from mvps.plan import Parts, first_pass
+from mvps.progress import Progress
+from mvps.reconstruct import Settings, all_lights, first_lights, parted, rough_shape, stage_one, stage_two, versions
+from mvps.scene import Capture, Lights, Reconstruction, Surface
+from mvps.visibility import ray_caster
+
+
+def hull(capture: Capture, settings: Settings, given: Lights | None, progress: Progress) -> Reconstruction:
+    """The visual hull, under the lights of the factorisation or given ones."""
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    _, surface = rough_shape(used, progress)
+    lights = first_lights(used, surface, given, settings.seed, progress)
+    return on_surface(capture, surface, lights, settings, progress, "the visual hull")
+
+
+def stage1(capture: Capture, settings: Settings, given: Lights | None, progress: Progress) -> Reconstruction:
+    """What Stage I makes of the normals and lights that Stage II found on the hull."""
+    device = chosen_device(settings.device)
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    grid, surface = rough_shape(used, progress)
+    lights = first_lights(used, surface, given, settings.seed, progress)
+    with progress.stage("photometric stereo"):
+        maps = normal_maps(*thinned(used, lights), device)
+    plan = first_pass(given is None, False)
+    rough = stage_two("first refinement", used, surface, lights, maps, Parts().law(), plan, settings, progress)
+    field = Occupancy(used, grid, OccupancySettings(), settings.seed, device)
+    surface = stage_one(field, rough.maps, OccupancySettings(), progress)
+    return on_surface(capture, surface, rough.lights, settings, progress, "Stage I alone")
+
+
+def on_surface(capture: Capture, surface: Surface, lights: Lights, settings: Settings, progress: Progress, words: str) -> Reconstruction:
+    """A result with Lambert's albedo and the surface's own normals. lights: of the photographs that are not held out; words: of what this
+    is, for the status."""
+    device = chosen_device(settings.device)
+    used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    with progress.stage("albedo"):
+        material = lambertian(used, surface, lights, device)
+        complete = all_lights(capture, used, held, lights, surface, material, device)
+        caster = ray_caster(surface)
+        pictures = tuple(mesh_normals(caster, view).astype(np.float32) for view in capture.views)
+    return Reconstruction(
+        surface,
+        material,
+        complete,
+        tuple(view.name for view in capture.views),
+        tuple(view.lights for view in capture.views),
+        pictures,
+        {"stages": progress.stages, "status": {"name": "not refined", "text": f"This is {words}."}},
+        {**asdict(settings), "versions": versions()},
+    )

@@ -1,0 +1,114 @@
+"""Methods side by side, on a small made capture."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mvps.command import run
+from mvps.compare.__main__ import main
+from mvps.compare.pictures import cropped, error_picture
+from mvps.compare.running import Run, known_runs
+from mvps.compare.tables import as_csv, as_markdown, as_text, rows
+from mvps.synthetic.files import write_capture
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("compare") / "made"
+    write_capture(*render_capture(SceneSettings(views=5, lights=8, size=64)), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def compared(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("compare") / "out"
+    assert run(main, [str(capture), "--methods", "ours-draft,hull", "--hold-out-views", "3", "--out", str(out), "--quiet"]) == 0
+    return out
+
+
+def test_table_pictures_and_meshes(compared: Path) -> None:
+    table = list(csv.DictReader((compared / "table.csv").read_text().splitlines()))
+    assert [row["method"] for row in table] == ["ours-draft", "hull"]
+    assert float(table[0]["mesh normal deg"]) < float(table[1]["mesh normal deg"])
+    assert float(table[0]["Chamfer px"]) < float(table[1]["Chamfer px"])
+    assert all(float(row["s"]) > 0 and float(row["held-out views PSNR dB"]) > 10 for row in table)
+    picture = cv2.imread(str(compared / "normals.png"))
+    assert picture is not None and picture.std() > 20
+    assert (compared / "hull" / "mesh.ply").is_file()
+    assert (compared / "table.md").read_text().startswith("| method |")
+
+
+def test_what_is_there_is_not_run_again(capture: Path, compared: Path) -> None:
+    before = (compared / "hull" / "mesh.ply").stat().st_mtime_ns
+    runs = json.loads((compared / "runs.json").read_text())
+    assert run(main, [str(capture), "--methods", "hull", "--hold-out-views", "3", "--out", str(compared), "--quiet"]) == 0
+    assert (compared / "hull" / "mesh.ply").stat().st_mtime_ns == before and json.loads((compared / "runs.json").read_text()) == runs
+    assert run(main, [str(capture), "--methods", "hull", "--out", str(compared), "--quiet"]) == 0
+    assert (compared / "hull" / "mesh.ply").stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--methods", "ours,magic"], "wanted some of ours"),
+        (["--methods", "hull", "--views", "0"], "wanted numbers from 1"),
+    ],
+)
+def test_bad_options(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str) -> None:
+    assert run(main, [str(capture), *options, "--out", str(tmp_path / "out")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_capture_that_no_method_can_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert run(main, [str(empty), "--methods", "hull", "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert "Calib_Results.mat" in capsys.readouterr().err and "Calib_Results.mat" in known_runs(tmp_path / "out")["hull"].failed
+
+
+def test_a_method_that_cannot_run_says_why(capture: Path, compared: Path, tmp_path: Path) -> None:
+    bare = tmp_path / "bare"
+    shutil.copytree(capture, bare, ignore=shutil.ignore_patterns("light_directions.txt"))
+    shutil.copytree(compared, tmp_path / "out")
+    options = ["--methods", "hull,calibrated", "--out", str(tmp_path / "out"), "--quiet"]
+    assert run(main, [str(bare), *options, "--hold-out-views", "3"]) == 0
+    runs = known_runs(tmp_path / "out")
+    assert "light_directions.txt" in runs["calibrated"].failed and not runs["hull"].failed
+    assert f"did not run: {runs['calibrated'].failed}" in (tmp_path / "out" / "table.md").read_text()
+
+
+def test_a_folder_with_other_files_stays(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    assert run(main, [str(capture), "--methods", "hull", "--out", str(tmp_path)]) == 2
+    assert "other files" in capsys.readouterr().err and [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_tables_leave_out_what_no_run_has() -> None:
+    runs = [Run("a", (), 12.3, 100.0, status="converged", errors={"chamfer_px": 0.1234}), Run("b", (), failed="no lights")]
+    lines = rows(runs)
+    assert lines == [
+        ["method", "Chamfer px", "s", "peak MB", "status"],
+        ["a", "0.123", "12", "100", "converged"],
+        ["b", "-", "-", "-", "did not run: no lights"],
+    ]
+    assert as_markdown(lines).splitlines()[1] == "| --- | --- | --- | --- | --- |"
+    assert len({len(line.rstrip()) for line in as_text(lines).splitlines()[:2]}) == 2 and as_csv(lines).count("\n") == 3
+
+
+def test_errors_are_seen_where_both_are_known() -> None:
+    truth = np.full((4, 6, 3), np.nan)
+    truth[1:3, 2:5] = [0.0, 0.0, 1.0]
+    assert cropped(truth) == (slice(1, 3), slice(2, 5))
+    turned = np.where(np.isnan(truth), np.nan, [0.0, 1.0, 0.0])
+    turned[1, 2] = np.nan
+    picture = error_picture(turned, truth)
+    assert (picture[1, 2] == 0).all() and picture[2, 2].astype(int).sum() > 600 and (picture[0] == 0).all()
