@@ -32,22 +32,13 @@ class Method:
     calibrated: bool = False
 
 
-def _ours(preset: str) -> Run:
-    def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
-        from mvps.reconstruct import reconstruct
-
-        return reconstruct(capture, replace(settings, preset=preset), lights, progress)
-
-    return run_
-
-
-def _ablation(parts: Callable[[], Parts]) -> Run:
-    """Ours, standard, with these parts alone; a function makes them, for their module takes a second to import."""
+def _ours(preset: str, parts: Callable[[], Parts] | None = None) -> Run:
+    """Ours with these parts, all if None; a function makes them, for their module takes a second to import."""
 
     def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
         from mvps.reconstruct import reconstruct
 
-        return reconstruct(capture, settings, lights, progress, parts())
+        return reconstruct(capture, replace(settings, preset=preset), lights, progress, parts() if parts else None)
 
     return run_
 
@@ -66,13 +57,17 @@ def _no_neural() -> Parts:
     return Parts(model=replace(LARGEST, neural=False))
 
 
-def _without(**parts: bool) -> Callable[[], Parts]:
+def _with(**parts: float) -> Callable[[], Parts]:
     def made() -> Parts:
         from mvps.plan import Parts
 
         return Parts(**parts)  # type: ignore[arg-type]
 
     return made
+
+
+def _ablation(parts: Callable[[], Parts]) -> Run:
+    return _ours("standard", parts)
 
 
 def _hull(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
@@ -94,15 +89,22 @@ METHODS = {
     "hull": Method("the visual hull, lights of the factorisation", _hull),
     "stage1": Method("Stage I alone: normal-regularised occupancy field", _stage1),
     "lambert": Method("ours with albedo alone: no lobes, no inter-reflection, no neural residual", _ablation(_lambert)),
-    "microfacet": Method("ours with GGX lobes in place of spherical Gaussians", _ablation(_without(microfacet=True))),
-    "fixed-light": Method("ours with the lights of the factorisation, never refined", _ablation(_without(free_lights=False))),
-    "no-visibility": Method("ours without cast shadows", _ablation(_without(shadows=False))),
-    "per-view-lights": Method("ours with the lights of every view on their own", _ablation(_without(one_rig=False))),
-    "no-vertex-step": Method("ours, but Stage II leaves the vertices where Stage I put them", _ablation(_without(moves=False))),
+    "microfacet": Method("ours with GGX lobes in place of spherical Gaussians", _ablation(_with(microfacet=True))),
+    "fixed-light": Method("ours with the lights of the factorisation, never refined", _ablation(_with(free_lights=False))),
+    "no-visibility": Method("ours without cast shadows", _ablation(_with(shadows=False))),
+    "per-view-lights": Method("ours with the lights of every view on their own", _ablation(_with(one_rig=False))),
+    "no-vertex-step": Method("ours, but Stage II leaves the vertices where Stage I put them", _ablation(_with(moves=False))),
     "no-neural": Method("ours without a neural residual", _ablation(_no_neural)),
     "calibrated": Method("ours with the true lights", _ours("standard"), calibrated=True),
+    "draft-2x": Method("preset draft with edges twice as long", _ours("draft", _with(edges=2.0))),
+    "draft-1.4x": Method("preset draft with edges 1.4 times as long", _ours("draft", _with(edges=1.4))),
+    "standard-2x": Method("preset standard with edges twice as long", _ours("standard", _with(edges=2.0))),
+    "standard-1.4x": Method("preset standard with edges 1.4 times as long", _ours("standard", _with(edges=1.4))),
 }
 """By the name that --method and --methods take."""
+
+BUDGETS = ("draft-2x", "draft-1.4x", "ours-draft", "standard-2x", "standard-1.4x", "ours", "ours-fine")
+"""Ours as its budget grows, for the curve of error against time."""
 
 
 def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:

@@ -22,6 +22,7 @@ class Parts:
     one_rig      lights that stand still with the camera are looked for
     free_lights  lights are refined after their first estimate
     moves        vertices move, to where views agree
+    edges        of the meshes, over those of the preset: a budget
     """
 
     model: Model = LARGEST
@@ -30,6 +31,7 @@ class Parts:
     one_rig: bool = True
     free_lights: bool = True
     moves: bool = True
+    edges: float = 1.0
 
     def law(self) -> Law:
         """The image model to start with."""
@@ -37,7 +39,7 @@ class Parts:
 
     def of(self, plan: RefineSettings) -> RefineSettings:
         """The plan with these parts alone."""
-        rounds = plan.rounds if self.moves else tuple(replace(one, fusions=0) for one in plan.rounds)
+        rounds = tuple(replace(one, edge=one.edge * self.edges, fusions=one.fusions if self.moves else 0) for one in plan.rounds)
         return replace(plan, rounds=rounds, free_lights=plan.free_lights and self.free_lights, model=self.model)
 
 

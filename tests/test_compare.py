@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ import pytest
 
 from mvps.command import run
 from mvps.compare.__main__ import main
+from mvps.compare.curve import Point, dominated, drawings, points_of, ticks
 from mvps.compare.pictures import cropped, error_picture
 from mvps.compare.running import Run, known_runs
 from mvps.compare.tables import as_csv, as_markdown, as_text, rows
@@ -93,14 +95,14 @@ def test_a_folder_with_other_files_stays(capture: Path, tmp_path: Path, capsys: 
 
 
 def test_tables_leave_out_what_no_run_has() -> None:
-    runs = [Run("a", (), 12.3, 100.0, status="converged", errors={"chamfer_px": 0.1234}), Run("b", (), failed="no lights")]
+    runs = [Run("a", (), 12.3, 20.0, 100.0, status="converged", errors={"chamfer_px": 0.1234}), Run("b", (), failed="no lights")]
     lines = rows(runs)
     assert lines == [
-        ["method", "Chamfer px", "s", "peak MB", "status"],
-        ["a", "0.123", "12", "100", "converged"],
-        ["b", "-", "-", "-", "did not run: no lights"],
+        ["method", "Chamfer px", "s", "processor s", "peak MB", "status"],
+        ["a", "0.123", "12", "20", "100", "converged"],
+        ["b", "-", "-", "-", "-", "did not run: no lights"],
     ]
-    assert as_markdown(lines).splitlines()[1] == "| --- | --- | --- | --- | --- |"
+    assert as_markdown(lines).splitlines()[1] == "|" + " --- |" * 6
     assert len({len(line.rstrip()) for line in as_text(lines).splitlines()[:2]}) == 2 and as_csv(lines).count("\n") == 3
 
 
@@ -112,3 +114,18 @@ def test_errors_are_seen_where_both_are_known() -> None:
     turned[1, 2] = np.nan
     picture = error_picture(turned, truth)
     assert (picture[1, 2] == 0).all() and picture[2, 2].astype(int).sum() > 600 and (picture[0] == 0).all()
+
+
+def test_curve_joins_our_budgets_and_names_all() -> None:
+    runs = [
+        Run(name, (), seconds, errors={"chamfer_px": error})
+        for name, seconds, error in (("ours", 50, 0.1), ("ours-draft", 15, 0.2), ("hull", 5, 2))
+    ]
+    (text,) = drawings(runs).values()
+    root = ElementTree.fromstring(text)
+    assert [t.text for t in root.iter("{http://www.w3.org/2000/svg}text")].count("hull") == 1
+    (line,) = root.iter("{http://www.w3.org/2000/svg}polyline")
+    assert len(line.attrib["points"].split()) == 2
+    assert dominated(points_of(runs, "chamfer_px")) == {"hull": False}
+    assert dominated([Point(60, 0.1, "slow"), *points_of(runs, "chamfer_px")]) == {"slow": True, "hull": False}
+    assert ticks(0.9, 6) == [1, 2, 5]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mvps.command import parse, parser, run
-from mvps.methods import METHODS, OPTIONS, listed_methods
+from mvps.methods import BUDGETS, METHODS, OPTIONS, listed_methods
 from mvps.progress import Progress
 from mvps.scene import CaptureError
 
@@ -61,21 +61,27 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("capture", type=Path, help="folder in the DiLiGenT-MV layout")
     made.add_argument("--methods", type=method_list, default="ours,ours-draft,hull", metavar="NAME,NAME", help="some of the above")
     made.add_argument("--out", type=Path, required=True, help="folder of the comparison; what it holds is kept")
+    made.add_argument("--curve", action="store_true", help="run ours with growing budgets too, and draw error against time")
     for name, (kind, _, words) in OPTIONS.items():
         made.add_argument(f"--{name}", type=checked(kind), default=SUPPRESS, help=words)
     given = parse(made, argv)
+    from mvps.compare.curve import drawings
     from mvps.compare.running import run_all
     from mvps.compare.tables import as_csv, as_markdown, as_text, rows
 
     texts = {name: getattr(given, name.replace("-", "_"), None) for name in OPTIONS}
     options = [f"--{name}={text}" for name, text in texts.items() if text is not None]
-    runs = run_all(given.capture, given.methods, options, given.out, Progress())
-    chosen = [runs[name] for name in given.methods]
+    methods = tuple(dict.fromkeys((*given.methods, *(BUDGETS if given.curve else ()))))
+    runs = run_all(given.capture, methods, options, given.out, Progress())
+    chosen = [runs[name] for name in methods]
     if all(one.failed for one in chosen):
         raise CaptureError(chosen[0].failed)
     lines = rows(chosen)
     (given.out / "table.md").write_text(as_markdown(lines) + "\n", encoding="utf-8")
     (given.out / "table.csv").write_text(as_csv(lines), encoding="utf-8")
+    if given.curve:
+        for key, text in drawings(chosen).items():
+            (given.out / f"curve_{key}.svg").write_text(text, encoding="utf-8")
     write_pictures(given.capture, [one.method for one in chosen if not one.failed], given.out)
     print(as_text(lines))
 

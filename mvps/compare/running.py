@@ -1,6 +1,7 @@
 """Every method in a process of its own, so that its time and its largest memory are its own. What has run with the same options stays.
 
-Seconds are of the whole process, imports and reading included; memory is its largest resident set.
+Seconds are of the whole process, imports and reading included; processor seconds, of all cores, say less of what else the machine does.
+Memory is the largest resident set.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class Run:
     method: str
     options: tuple[str, ...]
     seconds: float = 0.0
+    processor_seconds: float = 0.0
     peak_memory_mb: float = 0.0
     failed: str = ""
     status: str = ""
@@ -73,13 +75,14 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
         process = subprocess.Popen(command, stderr=complaints)
         _, status, usage = os.wait4(process.pid, 0)
         seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
+        busy = usage.ru_utime + usage.ru_stime
         process.returncode = code
         complaints.seek(0)
         said = complaints.read().strip()
     if code == 130:
         raise KeyboardInterrupt
     if code == 2:
-        return Run(name, tuple(options), seconds, failed=said.splitlines()[-1].removeprefix("mvps: "))
+        return Run(name, tuple(options), seconds, busy, failed=said.splitlines()[-1].removeprefix("mvps: "))
     if code:
         raise RuntimeError(f"{' '.join(command)}: exit code {code}\n{said}")
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
@@ -87,4 +90,4 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
     known = truth.surface is not None or truth.normals or truth.direction
     errors = evaluate_result(folder, capture) if known else {}
     # Linux counts in units of 1024 bytes.
-    return Run(name, tuple(options), seconds, usage.ru_maxrss * 1024 / 1e6, "", metrics["status"]["name"], errors)
+    return Run(name, tuple(options), seconds, busy, usage.ru_maxrss * 1024 / 1e6, "", metrics["status"]["name"], errors)

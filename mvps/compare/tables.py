@@ -36,10 +36,10 @@ COLUMNS = (
 def rows(runs: Sequence[Run]) -> list[list[str]]:
     """Title row and one row a run; columns that no run has are left out."""
     kept = [column for column in COLUMNS if any(column.key in run.errors for run in runs)]
-    lines = [["method", *(column.title for column in kept), "s", "peak MB", "status"]]
+    lines = [["method", *(column.title for column in kept), "s", "processor s", "peak MB", "status"]]
     for run in runs:
         figures = [f"{c.factor * run.errors[c.key]:.{c.digits}f}" if c.key in run.errors else "-" for c in kept]
-        cost = ["-", "-"] if run.failed else [f"{run.seconds:.0f}", f"{run.peak_memory_mb:.0f}"]
+        cost = ["-"] * 3 if run.failed else [f"{x:.0f}" for x in (run.seconds, run.processor_seconds, run.peak_memory_mb)]
         lines.append([run.method, *figures, *cost, f"did not run: {run.failed}" if run.failed else run.status])
     return lines
 
