@@ -1,0 +1,132 @@
+"""docs/results.md: every method on every capture, error against time, and the claims of PS-NeRF's paper one by one.
+
+    python benchmarks/results.py CAPTURES --out DIR
+
+DIR keeps the runs of mvps.compare: what is there is not run again. The sweeps are those of benchmarks/sweeps.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mvps.compare.curve import MEASURES, dominated, points_of
+from mvps.compare.running import Run, known_runs
+from mvps.compare.tables import as_markdown, rows
+from mvps.methods import BUDGETS, METHODS
+
+HERE = Path(__file__).resolve().parent
+DOCS = HERE.parent / "docs"
+CAPTURES = ("bunny", "armadillo", "spot", "buddha")
+PUBLISHED = ("pj16", "lz20")
+
+Runs = Mapping[str, Run]
+
+
+def compared(capture: Path, out: Path) -> dict[str, Run]:
+    """All methods on a capture."""
+    methods = ",".join(METHODS)
+    subprocess.run([sys.executable, "-m", "mvps.compare", str(capture), "--methods", methods, "--curve", "--out", str(out)], check=True)
+    return known_runs(out)
+
+
+def error(run: Run, key: str, digits: int = 2) -> str:
+    """An error as text; "-" without one."""
+    return f"{run.errors[key]:.{digits}f}" if key in run.errors else "-"
+
+
+def against(runs: Mapping[str, Runs], better: str, worse: str, key: str) -> tuple[str, bool]:
+    """The error of two methods on every capture, as text, and whether the first is lower on all of them."""
+    pairs = [(name, of[better], of[worse]) for name, of in runs.items() if key in of[better].errors and key in of[worse].errors]
+    text = ", ".join(f"{name} {error(b, key)} against {error(a, key)}" for name, a, b in pairs)
+    return text, bool(pairs) and all(a.errors[key] < b.errors[key] for _, a, b in pairs)
+
+
+def along(sweep: Sequence[Mapping[str, Any]], values: Sequence[str], key: str) -> str:
+    """A sweep's errors as text."""
+    return ", ".join(f"{value}: {run['errors'][key]:.2f}" for value, run in zip(values, sweep, strict=True) if key in run["errors"])
+
+
+def claims(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> list[list[str]]:
+    """Claim, our figures, whether they bear it out; mesh normals' mean error in deg where nothing else is said."""
+    normal, light = "mesh_normal_error_deg", "light_error_deg"
+    pairs = (
+        ("normal supervision helps (density)", "nerf+n", "nerf", normal),
+        ("normal supervision helps (occupancy)", "unisurf+n", "unisurf", normal),
+        ("joint optimisation improves normals", "ours", "stage1", normal),
+        ("joint optimisation improves lights (deg)", "ours", "hull", light),
+        ("fixed lights hurt", "ours", "fixed-light", normal),
+        ("no visibility hurts", "ours", "no-visibility", normal),
+        ("Gaussian lobes beat microfacets", "ours", "microfacet", normal),
+    )
+    lines = [["claim of the paper", "before against after, mean error", "holds"]]
+    for words, better, worse, key in pairs:
+        text, holds = against(runs, better, worse, key)
+        lines.append([words, text, "yes" if holds else "not on all"])
+    if "lights" in sweeps:
+        errors = [run["errors"][normal] for run in sweeps["lights"]]
+        text = along(sweeps["lights"], ("1", "2", "4", "8", "16", "32 lights"), normal)
+        lines.append(["4 lights come close to all", text, f"{errors[2] / errors[-1]:.2f} times the error of all"])
+    if "views" in sweeps:
+        errors = [run["errors"][normal] for run in sweeps["views"]]
+        text = along(sweeps["views"], ("5", "10", "15", "20 views"), normal)
+        lines.append(["5 views suffice", text, f"{errors[0] / errors[-1]:.2f} times the error of 20"])
+    if "strength" in sweeps:
+        text = along(sweeps["strength"], ("0", "0.5", "1", "2 times the highlights"), normal)
+        lines.append(["robust to specularity", text, "see the figures"])
+    return lines
+
+
+def verdict(runs: Runs) -> str:
+    """Where a method that is not ours wins."""
+    lines = []
+    for key in MEASURES:
+        best = min((run for run in runs.values() if key in run.errors), key=lambda run: run.errors[key])
+        lines.append(f"lowest {key}: {best.method} ({best.errors[key]:.3f})")
+        for name, is_dominated in dominated(points_of([r for r in runs.values() if r.method in (*BUDGETS, *PUBLISHED)], key)).items():
+            if not is_dominated:
+                lines.append(f"{name} is faster than any of ours that is as accurate ({key})")
+    return "; ".join(lines) + "."
+
+
+def page(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> str:
+    """The page as Markdown."""
+    parts = ["# Results", f"`python benchmarks/results.py CAPTURES --out DIR`; errors as in `mvps.evaluate`. Methods: {words()}."]
+    parts += ["## Claims of the paper", as_markdown(claims(runs, sweeps))]
+    for name, of_capture in runs.items():
+        chosen = [of_capture[method] for method in METHODS if method in of_capture]
+        parts += [f"## {name}", as_markdown(rows(chosen)), verdict({run.method: run for run in chosen if not run.failed})]
+        parts += [f"![{key} against time]({name}_{key}.svg)" for key in MEASURES]
+    return "\n\n".join(parts) + "\n"
+
+
+def words() -> str:
+    """What the methods are."""
+    return "; ".join(f"`{name}` {method.words}" for name, method in METHODS.items())
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("captures", type=Path)
+    parser.add_argument("names", nargs="*", help=" ".join(CAPTURES))
+    parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
+    given = parser.parse_args()
+    names = given.names or CAPTURES
+    runs = {name: compared(given.captures / name, given.out / name) for name in names}
+    for name in names:
+        for key in MEASURES:
+            shutil.copyfile(given.out / name / f"curve_{key}.svg", DOCS / f"{name}_{key}.svg")
+    found = HERE / "sweeps.json"
+    sweeps = json.loads(found.read_text(encoding="utf-8")) if found.exists() else {}
+    (DOCS / "results.md").write_text(page(runs, sweeps), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
