@@ -1,8 +1,8 @@
 """Figures that papers of the field have printed, each with the protocol by which it was measured.
 
 published.csv, a line per figure: data (DiLiGenT-MV, and PS-NeRF's Synth-PS and Synth-Env), object (in capitals; `average` over all
-objects of the data), method, protocol, metric, unit, value, source (paper and table), note. A figure of protocol p and metric m is the
-one that `mvps.evaluate` calls p_m; protocols are its own (mvps/measures/protocols.py), and two more:
+objects of the data, `one` for a single run), method, protocol, metric, unit, value, source (paper and table), note. A figure of
+protocol p and metric m is the one that `mvps.evaluate` calls p_m; protocols are its own (mvps/measures/protocols.py), and two more:
 
 other   measured by a protocol that `mvps.evaluate` does not have: of the same kind, but no figure to stand beside another
 time    seconds of a reconstruction, on the machine that the note names
