@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from mvps.command import run
-from mvps.evaluate import ROWS, main, read_views, table, write_json
+from mvps.evaluate import PROTOCOLS, ROWS, main, protocol_list, read_views, support_height, table, write_json
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.load import read_truth
 from mvps.mesh import vertex_normals
-from mvps.scene import Reconstruction, Surface
+from mvps.scene import Camera, Capture, Reconstruction, Surface, Truth, View
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -76,17 +76,55 @@ def test_figures_go_to_the_table_the_metrics_and_the_file(
 def test_every_figure_of_the_table_exists(folders: tuple[Path, Path], result: Path) -> None:
     run(main, [str(result), "--truth", str(folders[0])])
     errors = json.loads((result / "metrics.json").read_text())["truth"]
-    keys = [key for row in ROWS for key in row.keys if key]
+    keys = [key for row in ROWS["ours"] for key in row.keys if key]
     assert set(keys) <= set(errors)
     assert " - " not in table(errors) + " "
 
 
 def test_what_is_absent_is_a_dash() -> None:
     lines = table({"chamfer_mm": 0.25, "mesh_normal_error_deg": 3.0}).splitlines()
-    by_title = {line[:46].strip(): line[46:].split() for line in lines[1:]}
+    by_title = {line[:46].strip(): line[46:].split() for line in lines[2:]}
     assert by_title["Chamfer distance, mm"] == ["0.250"]
     assert by_title["mesh normals, mean error, degrees"] == ["3.00", "-", "-"]
     assert by_title["PSNR of held-out views, dB"] == ["-"]
+
+
+def test_other_protocols_have_their_own_blocks(
+    folders: tuple[Path, Path], result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [str(result), "--truth", str(folders[0])]
+    assert run(main, command) == 0 and run(main, [*command, "--protocols", "rnbneus,psnerf", "--json", str(tmp_path / "figures.json")]) == 0
+    ours, theirs = (text.strip() for text in capsys.readouterr().out.split("rnbneus: "))
+    assert ours.startswith("ours: first hits") and theirs.startswith("RNb-NeuS (CVPR 2024)") and "\n\npsnerf: PS-NeRF" in theirs
+    assert "100 LPIPS" in theirs and theirs.count("needs --lpips-weights") == 2
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert {name.partition("_")[0] for name in figures} == {"rnbneus", "psnerf"}
+    # Vertex to the same vertex, OFFSET_MM apart, or to one that is nearer.
+    assert 0.9 * OFFSET_MM < figures["rnbneus_chamfer_mm"] <= OFFSET_MM * (1 + 1e-6)
+    assert figures["psnerf_normal_error_deg"] < 0.01 and figures["psnerf_light_error_deg"] < 1e-5
+    kept = json.loads((result / "metrics.json").read_text())["truth"]
+    assert figures.items() <= kept.items() and "chamfer_mm" in kept, "the others stay"
+
+
+def test_protocols_are_all_or_some_of_those_that_there_are(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert protocol_list("all") == tuple(PROTOCOLS) == tuple(ROWS)
+    assert protocol_list("psnerf,ours,psnerf") == ("psnerf", "ours")
+    command = [str(folders[1]), "--truth", str(folders[0])]
+    assert "wanted all, or names among ours, supernormal, mvscps" in complaint([*command, "--protocols", "ours,dtu"], capsys)
+    assert "wanted psnerf among --protocols, given ours" in complaint([*command, "--lpips-weights", "alex.pth"], capsys)
+    monkeypatch.setitem(sys.modules, "lpips", None)
+    assert "run pip install mvps[lpips]" in complaint([*command, "--protocols", "psnerf", "--lpips-weights", "alex.pth"], capsys)
+
+
+@pytest.mark.parametrize(("name", "lights", "support"), [("bearPNG", 96, 0.0), ("bear", 96, 0.0), ("bear", 95, None), ("bunny", 96, None)])
+def test_what_diligent_mv_stands_on_is_known(name: str, lights: int, support: float | None) -> None:
+    views = tuple(f"view_{k:02d}" for k in range(1, 21))
+    truth = Truth(views, {}, {view: np.tile([0.0, 0, 1], (lights, 1)) for view in views}, {}, None)
+    camera = Camera(np.diag([10.0, 10, 1]), np.eye(3), np.zeros(3), 1, 1)
+    view = View("view_01", camera, np.zeros((1, 1), bool), np.zeros((0, 0, 3), np.uint16), 1.0, 1, ())
+    assert support_height(Capture(name, (view,)), truth) == support
 
 
 def test_only_held_out_photographs_are_decoded(folders: tuple[Path, Path]) -> None:
@@ -148,7 +186,7 @@ def test_help_loads_nothing_heavy(module: str) -> None:
 @pytest.mark.parametrize("name", ["bunny", "spot", "bear", "ball"])
 def test_the_truth_of_the_test_captures_agrees_with_itself(captures: Path, name: str) -> None:
     from mvps.measures import evaluate
-    from mvps.scene import Capture, Lights, Material
+    from mvps.scene import Lights, Material
 
     truth = read_truth(captures / name)
     surface = truth.surface or Surface(np.eye(3), np.array([[0, 1, 2]]))

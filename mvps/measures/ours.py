@@ -1,4 +1,4 @@
-"""How far a reconstruction is from the truth, and from photographs it has not seen.
+"""How far a reconstruction is from the truth, by measures of our own: what was photographed counts, and nothing else.
 
 First hits       p_i of the rays through the mask's pixel centres of all views, on the result and on the truth: every part of
                  the surface counts as often as it was photographed, and what no camera saw does not count.
@@ -9,24 +9,24 @@ F-score          harmonic mean of the shares of both point sets that are nearer 
 Signed offset    mean and median of +-d(p_result, truth), negative inside: the sign of (p - q) . normal(q). The median is what the whole
                  surface is shifted by; the mean also counts hollows that stay too shallow.
 Normals          angle(a, b) = 2 atan2(|a - b|, |a + b|) (Kahan), exact for small angles too.
-Lights           one scale for all lights and channels, s = (e . t) / (e . e); error = mean |s e - t| / t (Chen et al. 2019, eq. 8).
 Confidence       pixels by rising stated error in groups of equal number; stated mean angle sqrt(pi / 2) sigma (Rayleigh's distribution,
                  sigma along either tangent) beside the measured one, and the largest factor between them.
-Photographs      PSNR = mean over images of 10 log10(peak^2 / mean squared error) inside the mask; peak is the radiance at which
-                 the camera clips, the rendering is clipped there too; one scale for all images by least squares.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import igl
 import numpy as np
 
 from mvps.camera import pixel_footprint
+from mvps.measures.images import photograph_errors
+from mvps.measures.lights import by_photograph, held_out_photographs, held_out_views, light_errors, true_lights, unseen_views
+from mvps.measures.points import f_score
 from mvps.mesh import angles_deg, normalise, vertex_normals
-from mvps.scene import RELIABLE, Capture, Float, Lights, Material, Reconstruction, Surface, Truth, View
+from mvps.scene import RELIABLE, Capture, Float, Material, Reconstruction, Surface, Truth, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 
 CONFIDENCE_GROUPS = 10
@@ -36,12 +36,6 @@ LEAST_ERROR_DEG = 0.01
 
 F_SCORE_THRESHOLDS = (0.5, 1.0)
 """Units of the capture (mm): the two thresholds usual for objects the size of a hand."""
-
-Photograph = tuple[str, int]
-"""A photograph: the name of its view and the number of its light, counted from 1."""
-
-Light = tuple[Float, Float]
-"""Direction (3,), unit, world frame, and RGB intensity (3,)."""
 
 
 def first_hit_points(surface: Surface, capture: Capture) -> Float:
@@ -93,9 +87,7 @@ def surface_errors(surface: Surface, truth: Surface, capture: Capture) -> dict[s
     errors |= offsets | {"pixel_mm": pixel}
     errors["mesh_coverage"] = len(result_points) / sum(int(view.mask.sum()) for view in capture.views)
     for threshold in F_SCORE_THRESHOLDS:
-        precision, recall = float((to_truth < threshold).mean()), float((to_result < threshold).mean())
-        f_score = 2 * precision * recall / max(precision + recall, np.finfo(float).tiny)
-        errors[f"f_score_{threshold:g}_mm".replace(".", "_")] = f_score
+        errors[f"f_score_{threshold:g}_mm".replace(".", "_")] = f_score(to_truth, to_result, threshold)
     return errors
 
 
@@ -178,102 +170,14 @@ def confidence_errors(surface: Surface, material: Material, truth: Mapping[str, 
     return errors
 
 
-def by_photograph(lights: Lights, views: Sequence[str], numbers: Sequence[Sequence[int]]) -> dict[Photograph, Light]:
-    """The lights of `views`, by the photograph they lit; numbers: per view those of its lights, in the order of `lights`."""
-    return {
-        (view, number): (lights.direction[i][k], lights.intensity[i][k])
-        for i, view in enumerate(views)
-        for k, number in enumerate(numbers[i])
-    }
-
-
-def true_lights(truth: Truth) -> dict[Photograph, Light]:
-    """The true lights, by the photograph they lit, of the views whose directions and intensities are both known."""
-    return {
-        (view, k + 1): light
-        for view in truth.views
-        if view in truth.direction and view in truth.intensity
-        for k, light in enumerate(zip(truth.direction[view], truth.intensity[view], strict=True))
-    }
-
-
-def light_errors(estimated: Mapping[Photograph, Light], truth: Mapping[Photograph, Light]) -> dict[str, float]:
-    """Mean and largest angle in degrees and relative intensity error, over all photographs that both know.
-
-    Directions are in the world frame; intensities are compared up to one scale for all. No common photograph gives no figures.
-    """
-    common = [photograph for photograph in estimated if photograph in truth]
-    if not common:
-        return {}
-    direction, intensity = (np.stack(rows) for rows in zip(*(estimated[photograph] for photograph in common), strict=True))
-    true_direction, true_intensity = (np.stack(rows) for rows in zip(*(truth[photograph] for photograph in common), strict=True))
-    angle = angles_deg(direction, true_direction)
-    scale = float((intensity * true_intensity).sum() / (intensity**2).sum())
-    relative = np.abs(scale * intensity - true_intensity) / true_intensity
-    return {
-        "light_error_deg": float(angle.mean()),
-        "light_error_max_deg": float(angle.max()),
-        "intensity_error": float(relative.mean()),
-    }
-
-
-def photograph_errors(
-    surface: Surface, material: Material, lights: Mapping[Photograph, Light], capture: Capture, held_out_views: Collection[str] = ()
-) -> dict[str, float]:
-    """PSNR in dB of re-rendered photographs that were held out, separately for held-out views and for held-out lights.
-
-    lights: photograph -> its light as reconstructed, for the held-out photographs only. Those in `held_out_views` count as
-    held-out views, the others as held-out lights. Photographs that the capture lacks are left out. One scale serves all of
-    them and is reported as photograph_scale: intensities are relative, so it need not be 1.
-    """
-    from mvps.rendering import light_arriving, light_sources, photograph
-
-    caster, sources = ray_caster(surface), light_sources(surface, material)
-    pairs: list[tuple[View, Any, Any, Any]] = []
-    for view in capture.views:
-        kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]
-        if kept:
-            direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
-            arriving = light_arriving(sources, material, direction)
-            rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)
-            pairs.append((view, rendered, view.radiance(kept), view.usable(kept)))
-    if not pairs:
-        return {}
-    # Clipped samples say nothing about the scale.
-    products = [(float(r[u].ravel() @ p[u].ravel()), float(r[u].ravel() @ r[u].ravel())) for _, r, p, u in pairs]
-    scale = sum(a for a, _ in products) / max(sum(b for _, b in products), np.finfo(float).tiny)
-    psnr: dict[str, list[float]] = {"held_out_views_psnr_db": [], "held_out_lights_psnr_db": []}
-    for view, rendered, photographed, _ in pairs:
-        # Below the variance of rounding to a code value nothing can be told apart.
-        peak = view.scale * view.saturation
-        mean_square = ((np.minimum(scale * rendered, peak) - np.minimum(photographed, peak)) ** 2).mean((0, 2), dtype=np.float64)
-        group = "held_out_views_psnr_db" if view.name in held_out_views else "held_out_lights_psnr_db"
-        psnr[group] += (10 * np.log10(peak**2 / np.maximum(mean_square, view.scale**2 / 12))).tolist()
-    return {name: float(np.mean(values)) for name, values in psnr.items() if values} | {"photograph_scale": scale}
-
-
-def held_out_views(reconstruction: Reconstruction) -> tuple[str, ...]:
-    """Names of the views in the result that were held out (settings: hold_out_views, numbers counted from 1)."""
-    numbers = reconstruction.settings.get("hold_out_views") or []
-    return tuple(view for view in reconstruction.views if int(view.rpartition("_")[2]) in numbers)
-
-
-def held_out_photographs(reconstruction: Reconstruction) -> dict[Photograph, Light]:
-    """All photographs of held-out views and those of held-out lights (settings: hold_out_lights) in the others, with their lights."""
-    views, numbers = held_out_views(reconstruction), reconstruction.settings.get("hold_out_lights") or []
-    lights = by_photograph(reconstruction.lights, reconstruction.views, reconstruction.light_names)
-    return {(view, number): light for (view, number), light in lights.items() if view in views or number in numbers}
-
-
 def evaluate(reconstruction: Reconstruction, capture: Capture, truth: Truth) -> dict[str, float]:
-    """All measures of this file under the names of the report; what cannot be said is left out.
+    """All our measures under the names of the report, photographs and lights too; what cannot be said is left out.
 
     capture: cameras and masks of the views to look from, and the photographs that were held out (others are not looked at).
     Views that the result was not reconstructed from, held out or not in it at all, count as held out for the normals.
     mesh_... are the mesh's own normals, map_... the refined normal maps.
     """
-    held_out = held_out_views(reconstruction)
-    unseen = {view.name for view in capture.views if view.name in held_out or view.name not in reconstruction.views}
+    held_out, unseen = held_out_views(reconstruction), unseen_views(reconstruction, capture)
     errors = surface_errors(reconstruction.surface, truth.surface, capture) if truth.surface is not None else {}
     maps = dict(zip(reconstruction.views, reconstruction.normal_maps, strict=True))
     mapped = Capture(capture.name, tuple(view for view in capture.views if view.name in maps))
@@ -282,5 +186,5 @@ def evaluate(reconstruction: Reconstruction, capture: Capture, truth: Truth) -> 
     errors |= confidence_errors(reconstruction.surface, reconstruction.material, truth.normals, capture)
     lights = by_photograph(reconstruction.lights, reconstruction.views, reconstruction.light_names)
     errors |= light_errors(lights, true_lights(truth))
-    held_out_lights = held_out_photographs(reconstruction)
-    return errors | photograph_errors(reconstruction.surface, reconstruction.material, held_out_lights, capture, held_out)
+    photographs = held_out_photographs(reconstruction)
+    return errors | photograph_errors(reconstruction.surface, reconstruction.material, photographs, capture, held_out)
