@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from mvps.command import parse, parser, run
+from mvps.evaluate import PROTOCOLS, protocol_list
 from mvps.methods import BUDGETS, METHODS, OPTIONS, listed_methods
 from mvps.progress import Progress
+from mvps.published import AVERAGE, DILIGENT_OBJECTS, diligent_object
 from mvps.scene import CaptureError
 
 
@@ -31,6 +33,12 @@ def checked(kind: Callable[[str], Any]) -> Callable[[str], str]:
 
     text_of.__name__ = kind.__name__
     return text_of
+
+
+def capture_size(capture: Path) -> tuple[int, int]:
+    """Numbers of views and of photographs in the first of them."""
+    views = sorted(capture.glob("view_*"))
+    return len(views), sum(path.stem.isdecimal() for path in views[0].glob("*.png")) if views else 0
 
 
 def write_pictures(capture: Path, methods: Sequence[str], out: Path) -> None:
@@ -64,26 +72,34 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--curve", action="store_true", help="run ours with growing budgets too, and draw error against time")
     for name, (kind, _, words) in OPTIONS.items():
         made.add_argument(f"--{name}", type=checked(kind), default=SUPPRESS, help=words)
+    made.add_argument(
+        "--protocols", type=protocol_list, default="ours", metavar="NAMES", help=f"how to measure: all, or some of {', '.join(PROTOCOLS)}"
+    )
+    made.add_argument(
+        "--published",
+        choices=(*DILIGENT_OBJECTS, AVERAGE),
+        help="object of DiLiGenT-MV whose printed figures stand beside; the capture's own where it is one of them, else the average",
+    )
     given = parse(made, argv)
     from mvps.compare.curve import drawings
     from mvps.compare.running import run_all
-    from mvps.compare.tables import as_csv, as_markdown, as_text, rows
+    from mvps.compare.tables import protocol_rows, rows, write_tables
 
     texts = {name: getattr(given, name.replace("-", "_"), None) for name in OPTIONS}
     options = [f"--{name}={text}" for name, text in texts.items() if text is not None]
     methods = tuple(dict.fromkeys((*given.methods, *(BUDGETS if given.curve else ()))))
-    runs = run_all(given.capture, methods, options, given.out, Progress())
+    runs = run_all(given.capture, methods, options, given.out, Progress(), given.protocols)
     chosen = [runs[name] for name in methods]
     if all(one.failed for one in chosen):
         raise CaptureError(chosen[0].failed)
-    lines = rows(chosen)
-    (given.out / "table.md").write_text(as_markdown(lines) + "\n", encoding="utf-8")
-    (given.out / "table.csv").write_text(as_csv(lines), encoding="utf-8")
     if given.curve:
         for key, text in drawings(chosen).items():
             (given.out / f"curve_{key}.svg").write_text(text, encoding="utf-8")
-    write_pictures(given.capture, [one.method for one in chosen if not one.failed], given.out)
-    print(as_text(lines))
+    done = [one for one in chosen if not one.failed]
+    write_pictures(given.capture, [one.method for one in done], given.out)
+    printed = given.published or diligent_object(given.capture.name, *capture_size(given.capture)) or AVERAGE
+    tables = {"ours": rows(chosen)} | {name: protocol_rows(name, done, printed) for name in given.protocols if name != "ours"}
+    print(write_tables(tables, given.out))
 
 
 if __name__ == "__main__":

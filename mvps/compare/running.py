@@ -13,7 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from mvps.evaluate import evaluate_result, write_json
@@ -27,7 +27,7 @@ RUNS = "runs.json"
 @dataclass(frozen=True)
 class Run:
     """What came of a method. options: of mvps.methods, by which a run is known; failed: why there is no result, else empty; status: of the
-    result; errors: by the names of mvps.measures, where the capture has truth."""
+    result; protocols: of mvps.evaluate that were measured; errors: by their names, where the capture has truth."""
 
     method: str
     options: tuple[str, ...]
@@ -36,6 +36,7 @@ class Run:
     peak_memory_mb: float = 0.0
     failed: str = ""
     status: str = ""
+    protocols: tuple[str, ...] = ()
     errors: dict[str, float] = field(default_factory=dict)
 
 
@@ -46,13 +47,17 @@ def known_runs(out: Path) -> dict[str, Run]:
         return {}
     try:
         records = json.loads(path.read_text(encoding="utf-8"))
-        return {name: Run(**{**record, "options": tuple(record["options"])}) for name, record in records.items()}
+        return {
+            name: Run(**{**record, **{key: tuple(record[key]) for key in ("options", "protocols")}}) for name, record in records.items()
+        }
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise CaptureError(f"{path}: wanted the record of a comparison, given something else ({error}); give another --out") from error
 
 
-def run_all(capture: Path, methods: Sequence[str], options: Sequence[str], out: Path, progress: Progress) -> dict[str, Run]:
-    """Runs the methods that have not run with these options yet, evaluates them, and keeps the record in `out`."""
+def run_all(
+    capture: Path, methods: Sequence[str], options: Sequence[str], out: Path, progress: Progress, protocols: Sequence[str] = ("ours",)
+) -> dict[str, Run]:
+    """Runs the methods that have not run with these options yet, measures them by these protocols, and keeps the record in `out`."""
     if out.exists() and any(out.iterdir()) and not (out / RUNS).exists():
         raise CaptureError(f"{out}: wanted a new or empty folder or an earlier comparison, given a folder with other files")
     out.mkdir(parents=True, exist_ok=True)
@@ -63,12 +68,13 @@ def run_all(capture: Path, methods: Sequence[str], options: Sequence[str], out: 
             with progress.stage(name) as stage:
                 runs[name] = _run(capture, name, options, out / name)
                 stage.status(runs[name].failed or runs[name].status)
-            write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
+        runs[name] = _measured(runs[name], capture, out / name, protocols)
+        write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
     return runs
 
 
 def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
-    """One method and its errors. KeyboardInterrupt where the user interrupts it."""
+    """One method, not measured yet. KeyboardInterrupt where the user interrupts it."""
     command = [sys.executable, "-m", "mvps.methods", str(capture), "--method", name, "--out", str(folder), *options]
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+", encoding="utf-8") as complaints:
@@ -86,8 +92,16 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
     if code:
         raise RuntimeError(f"{' '.join(command)}: exit code {code}\n{said}")
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    truth = read_truth(capture)
-    known = truth.surface is not None or truth.normals or truth.direction
-    errors = evaluate_result(folder, capture) if known else {}
     # Linux counts in units of 1024 bytes.
-    return Run(name, tuple(options), seconds, busy, usage.ru_maxrss * 1024 / 1e6, "", metrics["status"]["name"], errors)
+    return Run(name, tuple(options), seconds, busy, usage.ru_maxrss * 1024 / 1e6, "", metrics["status"]["name"])
+
+
+def _measured(run: Run, capture: Path, folder: Path, protocols: Sequence[str]) -> Run:
+    """The run with errors by these protocols too; as it is where it failed or there is no truth."""
+    new = tuple(name for name in protocols if name not in run.protocols)
+    if run.failed or not new:
+        return run
+    truth = read_truth(capture)
+    if truth.surface is None and not truth.normals and not truth.direction:
+        return run
+    return replace(run, protocols=(*run.protocols, *new), errors=run.errors | evaluate_result(folder, capture, new))

@@ -1,13 +1,16 @@
-"""Runs as a table: text, Markdown, CSV."""
+"""Runs as tables: one by our own measures, one for every protocol of a paper with what papers printed; text, Markdown, CSV."""
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from mvps.compare.running import Run
+from mvps.evaluate import PROTOCOLS, ROWS, write_json
+from mvps.published import DILIGENT_MV, published
 
 
 class Column(NamedTuple):
@@ -44,6 +47,21 @@ def rows(runs: Sequence[Run]) -> list[list[str]]:
     return lines
 
 
+def protocol_rows(protocol: str, runs: Sequence[Run], printed: str) -> list[list[str]]:
+    """The same by one protocol of a paper: the runs, then what papers printed of DiLiGenT-MV's object `printed`, or "average"."""
+    keys = {row.keys[0]: row for row in ROWS[protocol] if row.keys[0]}
+    of_papers: dict[tuple[str, str], dict[str, float]] = {}
+    for key in keys:
+        for figure in published(DILIGENT_MV, {printed}, protocol, key.removeprefix(f"{protocol}_")):
+            of_papers.setdefault((figure.method, f"{figure.source}, {figure.object}"), {})[key] = figure.value
+    kept = [key for key in keys if any(key in run.errors for run in runs) or any(key in values for values in of_papers.values())]
+    lines = [["method", *(keys[key].title.strip() for key in kept), "source"]]
+    found = [(run.method, "this comparison", run.errors) for run in runs]
+    for method, source, errors in [*found, *((method, source, values) for (method, source), values in of_papers.items())]:
+        lines.append([method, *(keys[key].form.format(errors[key]) if key in errors else "-" for key in kept), source])
+    return lines
+
+
 def as_text(lines: list[list[str]]) -> str:
     """Columns of equal width."""
     width = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
@@ -64,3 +82,15 @@ def as_csv(lines: list[list[str]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(lines)
     return text.getvalue()
+
+
+def write_tables(tables: Mapping[str, list[list[str]]], out: Path) -> str:
+    """Tables by protocol as table.md, table.json and a CSV each (table.csv by our own measures, table_PROTOCOL.csv) in `out`; as text."""
+    for name, lines in tables.items():
+        (out / ("table.csv" if name == "ours" else f"table_{name}.csv")).write_text(as_csv(lines), encoding="utf-8")
+    records = {name: [dict(zip(lines[0], line, strict=True)) for line in lines[1:]] for name, lines in tables.items()}
+    write_json(out / "table.json", records)
+    heads = {name: f"{name}: {PROTOCOLS[name]}" for name in tables}
+    page = "\n\n".join(f"## {heads[name]}\n\n{as_markdown(lines)}" for name, lines in tables.items())
+    (out / "table.md").write_text(page + "\n", encoding="utf-8")
+    return "\n\n".join(f"{heads[name]}\n{as_text(lines)}" for name, lines in tables.items())
