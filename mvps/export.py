@@ -40,6 +40,9 @@ from mvps.texture import Textures, png_bytes
 RESULT_MARKS = ("settings.json", "mesh.ply")
 """Files by which a folder is known as an earlier result, which may be replaced."""
 
+CHECKPOINT = "checkpoint"
+"""Folder in a result's place from which an interrupted run goes on (checkpoint.py)."""
+
 
 def write_reconstruction(reconstruction: Reconstruction, folder: Path, textures: Textures | None = None, report: str = "") -> None:
     """Write a result folder, whole or not at all.
@@ -53,7 +56,7 @@ def write_reconstruction(reconstruction: Reconstruction, folder: Path, textures:
         "metrics.json": _json("metrics", reconstruction.metrics),
         "settings.json": _json("settings", reconstruction.settings),
     }
-    with appearing_whole(folder, RESULT_MARKS) as writing:
+    with appearing_whole(folder, RESULT_MARKS, CHECKPOINT) as writing:
         files |= _mesh_files(reconstruction)
         if textures is not None:
             files |= _model_files(reconstruction, textures)

@@ -12,21 +12,20 @@ from mvps.scene import CaptureError
 
 
 @contextmanager
-def appearing_whole(folder: Path, marks: tuple[str, ...] = ()) -> Iterator[Path]:
+def appearing_whole(folder: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> Iterator[Path]:
     """A folder to write into, which takes its place at `folder` when the block ends well and vanishes when it does not.
 
-    The place must be free, an empty folder, or a folder with all the files named in `marks`, by which an earlier output of the
-    same kind is known; that one is replaced. CaptureError where something else is there.
+    CaptureError as `check_place`.
     """
     place = Path(folder).resolve()
-    _check_place(place, marks)
+    check_place(place, marks, unfinished)
     place.parent.mkdir(parents=True, exist_ok=True)
     writing, aside = (place.with_name(f".{place.name}.{os.getpid()}.{use}") for use in ("writing", "replaced"))
     writing.mkdir()
     try:
         yield writing
         # Someone may have put something there in the meantime.
-        _check_place(place, marks)
+        check_place(place, marks, unfinished)
         if not place.exists():
             writing.rename(place)
             return
@@ -42,12 +41,14 @@ def appearing_whole(folder: Path, marks: tuple[str, ...] = ()) -> Iterator[Path]
             shutil.rmtree(writing)
 
 
-def _check_place(place: Path, marks: tuple[str, ...]) -> None:
+def check_place(place: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> None:
+    """CaptureError unless the place is free, an empty folder, or one that may be replaced: with all the files named in `marks`, by which an
+    earlier output of the same kind is known, or with nothing but what is called `unfinished`, the rest of an interrupted one."""
     if not place.exists():
         return
     if not place.is_dir():
         raise CaptureError(f"{place}: wanted a folder to write to, given a file; give another --out")
     earlier = bool(marks) and all((place / name).is_file() for name in marks)
-    if any(place.iterdir()) and not earlier:
+    if not earlier and any(path.name != unfinished for path in place.iterdir()):
         wanted = "a new or empty folder or an earlier result" if marks else "a new or empty folder"
         raise CaptureError(f"{place}: wanted {wanted}, given a folder with other files; give another --out or empty this one")

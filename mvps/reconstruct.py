@@ -7,10 +7,10 @@ capture -> visual hull -> lights -> photometric stereo of every view -> Stage I:
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mvps import __version__
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
@@ -19,6 +19,7 @@ from mvps.progress import Progress, peak_memory_mb
 from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
 if TYPE_CHECKING:
+    from mvps.checkpoint import Checkpoints
     from mvps.device import Device
     from mvps.joint.refine import Refined, RefineSettings
     from mvps.occupancy import Occupancy, OccupancySettings
@@ -241,10 +242,24 @@ def versions() -> dict[str, str]:
     return {"mvps": __version__, "python": platform.python_version(), **{name: version(name) for name in names}}
 
 
+class Begun(NamedTuple):
+    """What Stage II starts with."""
+
+    lights: Lights
+    maps: tuple[NormalMap, ...]
+    law: Law
+
+
 def reconstruct(
-    capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, parts: Parts | None = None
+    capture: Capture,
+    settings: Settings,
+    lights: Lights | None,
+    progress: Progress,
+    parts: Parts | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> Reconstruction:
-    """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None."""
+    """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
+    checkpoints: of long stages, kept and gone on from; none if None."""
     from mvps.device import chosen_device
     from mvps.joint.refine import POOR_FIT
     from mvps.joint.thinned import thinned
@@ -258,18 +273,25 @@ def reconstruct(
     start = first_lights(used, surface, lights, settings.seed, progress, parts.one_rig)
     with progress.stage("photometric stereo"):
         maps = normal_maps(*thinned(used, start), device)
-    law, free = parts.law(), lights is None
+    begun, free = Begun(start, maps, parts.law()), lights is None
+
+    def step(name: str, make: Callable[[], Any]) -> Any:
+        return make() if checkpoints is None else checkpoints.step(name, make, progress)
+
+    def refined_by(name: str, plan: RefineSettings, surface: Surface, of: Begun | Refined, carried: Any = None) -> Refined:
+        made: Refined = step(name, lambda: stage_two(name, used, surface, of.lights, of.maps, of.law, plan, settings, progress, carried))
+        return made
+
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":
-        refined = stage_two("joint refinement", used, surface, start, maps, law, parts.of(first_pass(free, True)), settings, progress)
+        refined = refined_by("joint refinement", parts.of(first_pass(free, True)), surface, begun)
     else:
-        rough = stage_two("first refinement", used, surface, start, maps, law, parts.of(first_pass(free, False)), settings, progress)
-        surface, between, rounds = shaped(used, grid, rough, settings, parts.of(between_passes(free)), progress)
+        rough = refined_by("first refinement", parts.of(first_pass(free, False)), surface, begun)
+        turns = parts.of(between_passes(free))
+        surface, between, rounds = step("shape", lambda: shaped(used, grid, rough, settings, turns, progress))
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
         plan = parts.of(last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT))
-        carried = between.carried
-        start, maps, law = between.lights, between.maps, between.law
-        refined = stage_two("joint refinement", used, surface, start, maps, law, plan, settings, progress, carried)
+        refined = refined_by("joint refinement", plan, surface, between, between.carried)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
         pictures = normal_pictures(capture, used, refined)
@@ -312,6 +334,21 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
         write_reconstruction(finished, out, textures, report_html(finished, capture))
 
 
+def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Lights | None, resume: bool) -> Checkpoints:
+    """Those of this run in its result's place."""
+    from mvps.checkpoint import Checkpoints, fingerprint
+    from mvps.device import chosen_device
+    from mvps.export import CHECKPOINT
+    from mvps.joint.blocks import Vertices
+    from mvps.joint.refine import Refined
+    from mvps.material import Trial
+    from mvps.scene import Law, Material, Residual, Surface
+
+    run = {"settings": asdict(settings), "versions": versions(), "capture": fingerprint(capture, lights)}
+    kinds = (Refined, Surface, Material, Residual, Lights, NormalMap, Law, Trial, Vertices)
+    return Checkpoints(out / CHECKPOINT, run, kinds, chosen_device(settings.device), resume)
+
+
 def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
     """The reconstruction's lights for just the photographs of `capture`."""
     directions, intensities = [], []
@@ -337,6 +374,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
     made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or end with what it takes")
     made.add_argument("--seed", type=int, default=0, help="of all random draws")
+    made.add_argument("--resume", action="store_true", help="go on where an interrupted run with the same options stopped")
     given = parse(made, argv)
     settings = Settings(
         str(given.capture),
@@ -349,6 +387,8 @@ def main(argv: Sequence[str]) -> None:
         given.device,
         given.seed,
     )
+    from mvps.export import CHECKPOINT, RESULT_MARKS
+    from mvps.folders import check_place
     from mvps.load import read_calibrated_lights, read_capture
 
     def before_decoding(sizes: list[tuple[int, int]]) -> None:
@@ -359,13 +399,15 @@ def main(argv: Sequence[str]) -> None:
 
             keep_below(given.max_memory, 1e6 * peak_memory_mb(), sizes, given.preset)
 
+    check_place(given.out.resolve(), RESULT_MARKS, CHECKPOINT)
     progress = Progress()
     with progress.stage("load") as stage:
         capture = read_capture(given.capture, given.views or None, given.lights or None, before_decoding)
         stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     lights = read_calibrated_lights(given.capture, used) if given.calibrated_lights else None
-    reconstruction = reconstruct(capture, settings, lights, progress)
+    kept = checkpoints_of(given.out, capture, settings, lights, given.resume)
+    reconstruction = reconstruct(capture, settings, lights, progress, checkpoints=kept)
     write(reconstruction, capture, settings, given.out, progress)
     print(f"{given.out}: {reconstruction.metrics['status']['name']}. {reconstruction.metrics['status']['text']}")
 
