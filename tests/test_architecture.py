@@ -19,7 +19,19 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("mvps", "solvers")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 SCRIPTS = sorted(path for folder in ("examples", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
-TORCH_ROOMS = ("device", "shading", "neural", "rendering", "photometric", "occupancy", "field", "fieldrays", "joint")
+TORCH_ROOMS = (
+    "device",
+    "shading",
+    "neural",
+    "rendering",
+    "photometric",
+    "occupancy",
+    "radiance",
+    "fieldtraining",
+    "field",
+    "fieldrays",
+    "joint",
+)
 
 
 def relative(path: Path) -> str:

@@ -189,7 +189,7 @@ def test_neural_residual(scene: SphereScene, device: torch.device, monkeypatch: 
 
 def test_stage_one(scene: SphereScene, device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     # The CPU too takes a batch as a whole here: the order of a sum is part of its value.
-    monkeypatch.setattr("mvps.occupancy.PARTS", 1)
+    monkeypatch.setattr("mvps.fieldtraining.PARTS", 1)
     plan = OccupancySettings(steps=20 if device == SIMULATED else 120, rays=256, ring_rays=128)
     hull = signed_distance(scene.capture, default_cells(scene.capture))
     maps = normal_maps(scene.capture, scene.reconstruction.lights, CPU)
