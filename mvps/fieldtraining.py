@@ -48,8 +48,8 @@ class TrainingSettings:
 
     steps, rays, ring_rays: Adam steps and rays in each; samples, ring_samples: per ray
     finest, levels, features: spacing of the finest grid, grids (each twice as coarse as the next), features on a node
-    hidden: units of the network; band, width: of the sampling interval (+-) and of the occupancy's edge, at first as wide as the hull of
-    few views bulges; step: of finite differences
+    hidden: units of the network; band, width: of the sampling interval (+-) and of the field's edge, at first as wide as the hull of few
+    views bulges; step: of finite differences
     ring: half-width in pixels of the ring around the silhouette; mask: weight of its loss
     grid_rate, network_rate: Adam's; voxel: of the extracted surface, at first as long as the edges that it is remeshed to; finer where the
     surface itself goes on: cells of 1.5 left spot's, `fine`, 0.014 px farther inside

@@ -29,7 +29,7 @@ from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose
 from mvps.mesh import angles_deg, edges, lengths, mean_edge_length, normalise, vertex_normals
-from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
+from mvps.scene import Bool, Capture, Float, Int, Law, Lights, Material, NormalMap, Surface
 
 SHARPNESS = (8.0, 32.0, 128.0)
 """Lobes' sharpness: half-value widths of 24, 12 and 6 degrees of the half vector, roughness about 0.7, 0.5 and 0.35 of a GGX lobe."""
@@ -306,12 +306,19 @@ def relative_residuals(views: list[ViewSamples], vertices: Vertices) -> torch.Te
     return relative
 
 
+def from_nearest(surface: Surface, known: Bool) -> Int:
+    """(V,) of every vertex the nearest one that is known (V,), itself where it is."""
+    nearest = np.arange(len(known))
+    nearest[~known] = np.flatnonzero(known)[cKDTree(surface.vertices[known]).query(surface.vertices[~known])[1]]
+    return nearest
+
+
 def material_of(state: State, albedo: Float) -> Material:
     """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
     assert state.vertices is not None
-    vertices, known = state.vertices, np.isfinite(albedo).all(1)
-    nearest = np.arange(len(albedo))
-    nearest[~known] = np.flatnonzero(known)[cKDTree(state.surface.vertices[known]).query(state.surface.vertices[~known])[1]]
+    vertices = state.vertices
+    known: Bool = np.isfinite(albedo[:, 0])
+    nearest = from_nearest(state.surface, known)
     normal = normalise(vertices.normal.double().cpu().numpy())
     normal[~known] = vertex_normals(state.surface)[~known]
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
