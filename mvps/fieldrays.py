@@ -1,4 +1,4 @@
-"""The rays that train an occupancy field: foreground pixels with their photometric stereo, and a ring around each silhouette.
+"""The rays that train a field: foreground pixels with what is known of them, and a ring around each silhouette.
 
 Local coordinates: (world - centre) / unit. A ray is anchored at its point nearest to the centre, so that distances along it stay small and
 exact in single precision:  x(t) = anchor + t direction.
@@ -6,6 +6,7 @@ exact in single precision:  x(t) = anchor + t direction.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,8 +24,8 @@ NEAR_ENOUGH = 0.25
 
 
 class FieldRays(NamedTuple):
-    """n rays: anchor, direction (n, 3); normal (n, 3), colour (n, 6) and weight (n,) of their pixels; inside (n,) 1 in the mask; stride
-    (n,) the largest of 4, 2, 1 that divides row and column."""
+    """n rays: anchor, direction (n, 3); normal (n, 3), colour (n, channels) and weight (n,) of their pixels; inside (n,) 1 in the mask;
+    stride (n,) the largest of 4, 2, 1 that divides row and column."""
 
     anchor: Tensor
     direction: Tensor
@@ -49,19 +50,36 @@ def _joined(parts: list[tuple[NDArray[Any], ...]], device: torch.device) -> Fiel
     return FieldRays(*(torch.tensor(np.concatenate(column), dtype=torch.float32, device=device) for column in zip(*parts, strict=True)))
 
 
+class PixelValues(NamedTuple):
+    """What rays of a view's foreground pixels (pixels, ...) are compared with: normal (3), colour (channels), weight of the normal; known:
+    those that take part."""
+
+    known: Bool
+    normal: Float
+    colour: Float
+    weight: Float
+
+
+def pixel_rays(capture: Capture, values: Iterable[PixelValues], centre: Float, unit: float, device: torch.device) -> FieldRays:
+    """Rays of the foreground pixels of all views."""
+    parts: list[tuple[NDArray[Any], ...]] = []
+    for view, (known, normal, colour, weight) in zip(capture.views, values, strict=True):
+        pixels = view.pixels[known]
+        anchor, direction = _anchored(view.camera, pixels, centre, unit)
+        parts.append((anchor, direction, normal[known], colour[known], weight[known], np.ones(len(anchor)), _stride(pixels)))
+    return _joined(parts, device)
+
+
 def foreground_rays(capture: Capture, normal_maps: tuple[NormalMap, ...], centre: Float, unit: float, device: torch.device) -> FieldRays:
     """Rays of the foreground pixels with a confidence over 0. Colour is albedo over the mean albedo, and the normal."""
     trusted = sum(float((maps.albedo.mean(1) * maps.confidence).sum()) for maps in normal_maps)
     total = sum(float(maps.confidence.sum()) for maps in normal_maps)
     level = max(trusted / max(total, 1e-12), 1e-12)
-    parts: list[tuple[NDArray[Any], ...]] = []
-    for view, maps in zip(capture.views, normal_maps, strict=True):
-        known = maps.confidence > 0
-        pixels, normal = view.pixels[known], maps.normal[known]
-        anchor, direction = _anchored(view.camera, pixels, centre, unit)
-        colour = np.concatenate([maps.albedo[known] / level, normal], 1)
-        parts.append((anchor, direction, normal, colour, maps.confidence[known], np.ones(len(anchor)), _stride(pixels)))
-    return _joined(parts, device)
+    values = (
+        PixelValues(maps.confidence > 0, maps.normal, np.concatenate([maps.albedo / level, maps.normal], 1), maps.confidence)
+        for maps in normal_maps
+    )
+    return pixel_rays(capture, values, centre, unit, device)
 
 
 def ring_pixels(mask: Bool, ring: int) -> Int:

@@ -82,12 +82,25 @@ def _stage1(capture: Capture, settings: Settings, lights: Lights | None, progres
     return stage1(capture, settings, lights, progress)
 
 
+def _radiance(density: bool, with_normals: bool) -> Run:
+    def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+        from mvps.stages import radiance
+
+        return radiance(capture, settings, lights, progress, density, with_normals)
+
+    return run_
+
+
 METHODS = {
     "ours": Method("all of the method, preset standard", _ours("standard")),
     "ours-draft": Method("preset draft: no Stage I, coarser mesh", _ours("draft")),
     "ours-fine": Method("preset fine: finer mesh", _ours("fine")),
     "hull": Method("the visual hull, lights of the factorisation", _hull),
     "stage1": Method("Stage I alone: normal-regularised occupancy field", _stage1),
+    "nerf": Method("radiance field of density, on light-averaged photographs", _radiance(True, False)),
+    "nerf+n": Method("the same with the loss on normals of photometric stereo", _radiance(True, True)),
+    "unisurf": Method("radiance field of occupancy, on light-averaged photographs", _radiance(False, False)),
+    "unisurf+n": Method("the same with the loss on normals of photometric stereo", _radiance(False, True)),
     "lambert": Method("ours with albedo alone: no lobes, no inter-reflection, no neural residual", _ablation(_lambert)),
     "microfacet": Method("ours with GGX lobes in place of spherical Gaussians", _ablation(_with(microfacet=True))),
     "fixed-light": Method("ours with the lights of the factorisation, never refined", _ablation(_with(free_lights=False))),

@@ -1,4 +1,9 @@
-"""Results of single stages, for comparison: the visual hull, and Stage I, each with Lambert's albedo under the lights of its time."""
+"""Results of single stages, for comparison, each with Lambert's albedo under the lights of its time.
+
+The visual hull; Stage I; and Stage I's ablations (Yang et al. 2022, "effectiveness of normal regularization"): radiance fields of density
+(NeRF) or occupancy (UNISURF), with and without the normals' loss. All fields have the same masks, start at the hull, rays, samples and
+steps; rendering and losses differ (radiance.py).
+"""
 
 from __future__ import annotations
 
@@ -14,6 +19,7 @@ from mvps.occupancy import Occupancy, OccupancySettings
 from mvps.photometric import normal_maps
 from mvps.plan import Parts, first_pass
 from mvps.progress import Progress
+from mvps.radiance import RadianceSettings, radiance_surface
 from mvps.reconstruct import Settings, all_lights, first_lights, parted, rough_shape, stage_one, stage_two, versions
 from mvps.scene import Capture, Lights, Reconstruction, Surface
 from mvps.visibility import ray_caster
@@ -42,13 +48,31 @@ def stage1(capture: Capture, settings: Settings, given: Lights | None, progress:
     return on_surface(capture, surface, rough.lights, settings, progress, "Stage I alone")
 
 
+def radiance(
+    capture: Capture, settings: Settings, given: Lights | None, progress: Progress, density: bool, with_normals: bool
+) -> Reconstruction:
+    """The surface of a radiance field, a density or an occupancy, trained with or without the views' photometric stereo."""
+    device, plan, maps = chosen_device(settings.device), RadianceSettings(), None
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    grid, rough = rough_shape(used, progress)
+    lights = first_lights(used, rough, given, settings.seed, progress)
+    if with_normals:
+        with progress.stage("photometric stereo"):
+            maps = normal_maps(*thinned(used, lights), device)
+    with progress.stage("radiance field", total=plan.steps) as stage:
+        surface = radiance_surface(
+            used, grid, lights, maps, density, plan, settings.seed, device, lambda _, loss: stage.advance(1, loss=loss)
+        )
+    return on_surface(capture, surface, lights, settings, progress, "a radiance field alone")
+
+
 def on_surface(capture: Capture, surface: Surface, lights: Lights, settings: Settings, progress: Progress, words: str) -> Reconstruction:
     """A result with Lambert's albedo and the surface's own normals. lights: of the photographs that are not held out; words: of what this
     is, for the status."""
     device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     with progress.stage("albedo"):
-        material = lambertian(used, surface, lights, device)
+        material = lambertian(*thinned(used, lights), surface, device)
         complete = all_lights(capture, used, held, lights, surface, material, device)
         caster = ray_caster(surface)
         pictures = tuple(mesh_normals(caster, view).astype(np.float32) for view in capture.views)

@@ -111,7 +111,7 @@ class _InTurn:
 @contextmanager
 def simulated_device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """The simulated device, while this lasts; random numbers on it are the CPU's."""
-    for module in ("mvps.cores", "mvps.occupancy", "mvps.joint.neural"):
+    for module in ("mvps.cores", "mvps.fieldtraining", "mvps.joint.neural"):
         monkeypatch.setattr(f"{module}.ThreadPoolExecutor", _InTurn)
     monkeypatch.setattr("torch.Generator", _Generator)
     with _Constants(), _Operations():

@@ -27,6 +27,8 @@ TORCH_ROOMS = (
     "rendering",
     "photometric",
     "occupancy",
+    "radiance",
+    "fieldtraining",
     "field",
     "fieldrays",
     "joint",

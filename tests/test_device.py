@@ -37,6 +37,7 @@ from mvps.neural import moments
 from mvps.occupancy import Occupancy, OccupancySettings
 from mvps.photometric import normal_maps
 from mvps.progress import Progress
+from mvps.radiance import RadianceSettings, radiance_surface
 from mvps.reconstruct import Settings
 from mvps.scene import CaptureError, Law, Reconstruction
 from mvps.shading import shade
@@ -189,7 +190,7 @@ def test_neural_residual(scene: SphereScene, device: torch.device, monkeypatch: 
 
 def test_stage_one(scene: SphereScene, device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
     # The CPU too takes a batch as a whole here: the order of a sum is part of its value.
-    monkeypatch.setattr("mvps.occupancy.PARTS", 1)
+    monkeypatch.setattr("mvps.fieldtraining.PARTS", 1)
     plan = OccupancySettings(steps=20 if device == SIMULATED else 120, rays=256, ring_rays=128)
     hull = signed_distance(scene.capture, default_cells(scene.capture))
     maps = normal_maps(scene.capture, scene.reconstruction.lights, CPU)
@@ -206,6 +207,20 @@ def test_stage_one(scene: SphereScene, device: torch.device, monkeypatch: pytest
         assert [float(loss) for loss in losses[0]] == [float(loss) for loss in losses[1]]
     else:
         # Other random numbers, and sums in an order of their own.
+        radius = [np.median(np.linalg.norm(surface.vertices, axis=1)) for surface in surfaces]
+        assert abs(radius[0] - radius[1]) < 0.01 * RADIUS
+
+
+@pytest.mark.parametrize("density", [True, False], ids=["density", "occupancy"])
+def test_radiance_fields(scene: SphereScene, device: torch.device, density: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvps.fieldtraining.PARTS", 1)
+    plan = RadianceSettings(steps=10 if device == SIMULATED else 120, rays=256, ring_rays=128)
+    hull, given = signed_distance(scene.capture, default_cells(scene.capture)), scene.reconstruction.lights
+    maps = normal_maps(scene.capture, given, CPU)
+    surfaces = [radiance_surface(scene.capture, hull, given, maps, density, plan, 0, on, lambda *_: None) for on in (device, CPU)]
+    if device == SIMULATED:
+        np.testing.assert_array_equal(surfaces[0].vertices, surfaces[1].vertices)
+    else:
         radius = [np.median(np.linalg.norm(surface.vertices, axis=1)) for surface in surfaces]
         assert abs(radius[0] - radius[1]) < 0.01 * RADIUS
 

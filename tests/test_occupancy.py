@@ -12,9 +12,10 @@ from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.field import covering, gradient
 from mvps.fieldrays import ring_pixels
+from mvps.fieldtraining import crossing
 from mvps.hull import default_cells, signed_distance
 from mvps.mesh import normalise
-from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings, composite, crossing
+from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings, composite
 from mvps.scene import Camera, Capture, NormalMap, Surface
 
 QUICK = OccupancySettings(steps=120, rays=512, ring_rays=256)

@@ -22,7 +22,7 @@ HELD = 1e-4
 """Standard deviation, radians, of normals from the mesh's: they stay."""
 
 
-def lambertian(capture: Capture, surface: Surface, lights: Lights, device: torch.device) -> Material:
+def lambertian(capture: Capture, lights: Lights, surface: Surface, device: torch.device) -> Material:
     """The surface's material without lobes: albedo (V, 3) under its own normals, from the photographs under lights (in their order)."""
     views, grey, law = observe(capture, surface, lights, device), grey_lights(lights, device), Law(())
     normal = torch.tensor(vertex_normals(surface), dtype=torch.float32, device=device)
