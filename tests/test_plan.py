@@ -1,0 +1,56 @@
+"""Parts of the method that can be left out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvps.material import LARGEST, Model
+from mvps.measures import distance_to
+from mvps.methods import BUDGETS, METHODS
+from mvps.plan import Parts, first_pass, last_pass
+from mvps.progress import Progress
+from mvps.reconstruct import Settings, reconstruct, rough_shape
+from mvps.scene import Capture, Reconstruction
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+
+@pytest.fixture(scope="module")
+def capture() -> Capture:
+    return render_capture(SceneSettings(views=5, lights=8, size=64))[0]
+
+
+def draft(capture: Capture, parts: Parts) -> Reconstruction:
+    return reconstruct(capture, Settings("made", preset="draft"), None, Progress(), parts)
+
+
+def test_without_lobes_shadows_or_a_rig(capture: Capture) -> None:
+    made = draft(capture, Parts(Model(), shadows=False, one_rig=False))
+    assert made.material.specular_weight.shape[1] == 0 and made.material.bounce == 0 and not made.material.shadows
+    assert made.metrics["model"]["components"] == [] and not made.lights.one_rig
+    whole = draft(capture, Parts())
+    assert whole.material.specular_weight.shape[1] > 0 and whole.material.shadows and whole.lights.one_rig
+
+
+def test_vertices_that_do_not_move_stay_on_the_hull(capture: Capture) -> None:
+    grid, hull = rough_shape(capture, Progress())
+    away = [np.abs(distance_to(draft(capture, Parts(moves=moves)).surface.vertices, hull)[0]).mean() for moves in (False, True)]
+    assert away[0] < 0.2 * grid.spacing < away[1]
+
+
+def test_lights_that_stay_are_those_of_the_factorisation(capture: Capture) -> None:
+    assert not Parts(free_lights=False).of(first_pass(True, True)).free_lights
+    fixed, free = (draft(capture, Parts(free_lights=free)) for free in (False, True))
+    assert np.abs(fixed.lights.direction[0] - free.lights.direction[0]).max() > 1e-3
+
+
+def test_parts_change_nothing_else() -> None:
+    for plan in (first_pass(True, False), first_pass(False, True), last_pass("standard", True), last_pass("fine", False)):
+        assert Parts().of(plan) == plan
+    coarse = Parts(edges=2.0).of(last_pass("standard", True))
+    assert [one.edge for one in coarse.rounds] == [3.0, 3.0] and coarse.model == LARGEST
+
+
+def test_budgets_are_methods() -> None:
+    assert set(BUDGETS) <= set(METHODS)
