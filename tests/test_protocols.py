@@ -61,7 +61,8 @@ def test_icp_undoes_a_rigid_motion() -> None:
     body = bumpy().vertices
     moved = body @ Rotation.from_rotvec([0.03, -0.05, 0.04]).as_matrix() + np.array([0.6, -0.4, 0.5])
     assert points.two_way(moved, body)[0].mean() > 0.5
-    assert np.abs(points.aligned(moved, body) - body).max() < 1e-6
+    rotation, shift = points.icp(moved, body)
+    assert np.abs(moved @ rotation.T + shift - body).max() < 1e-6 and np.linalg.det(rotation) == pytest.approx(1)
 
 
 def test_samples_are_uniform_by_area_and_the_same_each_time() -> None:

@@ -47,20 +47,19 @@ def surface_samples(surface: Surface, count: int, seed: int) -> Float:
     return points
 
 
-def aligned(points: Float, target: Float) -> Float:
-    """Points (n, 3) moved rigidly onto target (m, 3) by ICP, from where they are."""
-    moved, before = points, np.inf
-    tree = cKDTree(target)
+def icp(points: Float, target: Float) -> tuple[Float, Float]:
+    """Rotation (3, 3) and shift (3,) that bring points (n, 3), rotation @ point + shift, onto target (m, 3), from where they are."""
+    rotation, shift, before, tree = np.eye(3), np.zeros(3), np.inf, cKDTree(target)
     for _ in range(ICP_ROUNDS):
-        distance, index = tree.query(moved, workers=at_a_time())
+        distance, index = tree.query(points @ rotation.T + shift, workers=at_a_time())
         error = float(np.sqrt((distance**2).mean()))
         if error >= (1 - ICP_TOLERANCE) * before:
             break
         before, matched = error, target[index]
-        centre, onto = moved.mean(0), matched.mean(0)
-        rotation, _ = Rotation.align_vectors(matched - onto, moved - centre)
-        moved = rotation.apply(moved - centre) + onto
-    return moved
+        centre, onto = points.mean(0), matched.mean(0)
+        rotation = Rotation.align_vectors(matched - onto, points - centre)[0].as_matrix()
+        shift = onto - rotation @ centre
+    return rotation, shift
 
 
 def mean_curvature(surface: Surface) -> Float:

@@ -26,7 +26,7 @@ rnbneus          RNb-NeuS (Brument et al., CVPR 2024), the table of DiLiGenT-MV.
 
 Between vertices the distance grows with their spacing, and a coarse mesh of the right shape looks wrong. So mvpsnet and rnbneus
 have a second figure, ..._split_..., after the edges of both meshes were halved until none is longer than the mean edge of the
-finer one: the shapes are the same, and the spacing tells less.
+finer one: the shapes are the same, and the spacing tells less. ICP's motion is that of the meshes as they are.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ import numpy as np
 
 from mvps.measures.images import Perceptual
 from mvps.measures.ours import distance_to, evaluate, first_hit_points, mesh_normal_errors, object_centre
-from mvps.measures.points import aligned, f_score, mean_curvature, nearest, split_to, surface_samples, two_way
+from mvps.measures.points import f_score, icp, mean_curvature, nearest, split_to, surface_samples, two_way
 from mvps.measures.psnerf import psnerf_errors
 from mvps.mesh import mean_edge_length
 from mvps.scene import Bool, Capture, Float, Reconstruction, Surface, Truth
@@ -97,13 +97,20 @@ def psnerf_chamfer(surface: Surface, truth: Surface, centre: Float, scale: float
 
 def mvpsnet_errors(surface: Surface, truth: Surface, support: float) -> dict[str, float]:
     """Sum of the mean L1 distances between vertices above the support's height, after ICP; no figures where none is left."""
+    above, true_above = (_above(s, support + ABOVE_SUPPORT) for s in (surface, truth))
+    if not len(above) or not len(true_above):
+        return {}
+    rotation, shift = icp(above, true_above)
     errors = {}
     for name, meshes in _as_they_are_and_split(surface, truth).items():
-        points, true_points = (s.vertices[s.vertices[:, 2] >= support + ABOVE_SUPPORT] for s in meshes)
-        if len(points) and len(true_points):
-            to_truth, to_result = two_way(aligned(points, true_points), true_points, norm=1)
-            errors[f"mvpsnet_{name}chamfer_mm"] = float(to_truth.mean() + to_result.mean())
+        points, true_points = (_above(s, support + ABOVE_SUPPORT) for s in meshes)
+        to_truth, to_result = two_way(points @ rotation.T + shift, true_points, norm=1)
+        errors[f"mvpsnet_{name}chamfer_mm"] = float(to_truth.mean() + to_result.mean())
     return errors
+
+
+def _above(surface: Surface, height: float) -> Float:
+    return surface.vertices[surface.vertices[:, 2] >= height]
 
 
 def rnbneus_errors(surface: Surface, truth: Surface, capture: Capture) -> dict[str, float]:
