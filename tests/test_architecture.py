@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("mvps", "solvers")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 SCRIPTS = sorted(path for folder in ("examples", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
-TORCH_ROOMS = ("device", "shading", "neural", "rendering", "photometric", "occupancy", "field", "fieldrays", "joint")
+TORCH_ROOMS = ("baselines", "device", "shading", "neural", "rendering", "photometric", "occupancy", "field", "fieldrays", "joint")
 
 
 def relative(path: Path) -> str:
