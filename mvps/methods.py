@@ -7,7 +7,7 @@ written from their papers (mvps.baselines). Every one takes the same capture and
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,10 +91,39 @@ def _radiance(density: bool, with_normals: bool) -> Run:
     return run_
 
 
+def _lz20(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    from mvps.baselines.lz20 import lz20
+
+    assert lights is not None
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    return _whole(lz20(used, lights, progress), capture, settings)
+
+
+def _whole(made: Reconstruction, capture: Capture, settings: Settings) -> Reconstruction:
+    """The result for all views and lights, made of those that are not held out: lights of the others as ours have them, the mesh's normals
+    in the other views."""
+    import numpy as np
+
+    from mvps.device import chosen_device
+    from mvps.measures import mesh_normals
+    from mvps.reconstruct import all_lights, versions
+    from mvps.visibility import ray_caster
+
+    used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    lights = all_lights(capture, used, held, made.lights, made.surface, made.material, chosen_device(settings.device))
+    maps, caster = dict(zip(made.views, made.normal_maps, strict=True)), ray_caster(made.surface)
+    names = tuple(view.name for view in capture.views)
+    pictures = tuple(maps[v.name] if v.name in maps else mesh_normals(caster, v).astype(np.float32) for v in capture.views)
+    numbers = tuple(view.lights for view in capture.views)
+    account = {**asdict(settings), "versions": versions()}
+    return Reconstruction(made.surface, made.material, lights, names, numbers, pictures, made.metrics, account)
+
+
 METHODS = {
     "ours": Method("all of the method, preset standard", _ours("standard")),
     "ours-draft": Method("preset draft: no Stage I, coarser mesh", _ours("draft")),
     "ours-fine": Method("preset fine: finer mesh", _ours("fine")),
+    "lz20": Method("Li et al. 2020: isotropy, iso-depth contours, with the true lights", _lz20, calibrated=True),
     "hull": Method("the visual hull, lights of the factorisation", _hull),
     "stage1": Method("Stage I alone: normal-regularised occupancy field", _stage1),
     "nerf": Method("radiance field of density, on light-averaged photographs", _radiance(True, False)),

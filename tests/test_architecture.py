@@ -20,6 +20,7 @@ PACKAGES = ("mvps", "solvers")
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 SCRIPTS = sorted(path for folder in ("examples", "benchmarks") for path in (ROOT / folder).rglob("*.py"))
 TORCH_ROOMS = (
+    "baselines",
     "device",
     "checkpoint",
     "shading",
