@@ -1,0 +1,1 @@
+"""Published methods, written from their papers, with the same inputs and outputs as ours."""
