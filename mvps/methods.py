@@ -91,6 +91,13 @@ def _radiance(density: bool, with_normals: bool) -> Run:
     return run_
 
 
+def _pj16(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    from mvps.baselines.pj16 import pj16
+
+    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    return _whole(pj16(used, settings.seed, progress), capture, settings)
+
+
 def _lz20(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
     from mvps.baselines.lz20 import lz20
 
@@ -123,6 +130,7 @@ METHODS = {
     "ours": Method("all of the method, preset standard", _ours("standard")),
     "ours-draft": Method("preset draft: no Stage I, coarser mesh", _ours("draft")),
     "ours-fine": Method("preset fine: finer mesh", _ours("fine")),
+    "pj16": Method("Park et al. 2017: uncalibrated photometric stereo in a mesh's parameter domain", _pj16),
     "lz20": Method("Li et al. 2020: isotropy, iso-depth contours, with the true lights", _lz20, calibrated=True),
     "hull": Method("the visual hull, lights of the factorisation", _hull),
     "stage1": Method("Stage I alone: normal-regularised occupancy field", _stage1),
