@@ -16,15 +16,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from mvps.compare.curve import MEASURES, dominated, points_of
+from mvps.compare.pictures import cropped, side_by_side
 from mvps.compare.running import Run, known_runs
 from mvps.compare.tables import as_markdown, rows
+from mvps.export import read_reconstruction
+from mvps.load import read_truth
 from mvps.methods import BUDGETS, METHODS
 
 HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent / "docs"
 CAPTURES = ("bunny", "armadillo", "spot", "buddha")
 PUBLISHED = ("pj16", "lz20")
+PICTURED = ("ours", "lz20", "pj16", "stage1", "unisurf+n", "hull")
 
 Runs = Mapping[str, Run]
 
@@ -34,6 +40,16 @@ def compared(capture: Path, out: Path) -> dict[str, Run]:
     methods = ",".join(METHODS)
     subprocess.run([sys.executable, "-m", "mvps.compare", str(capture), "--methods", methods, "--curve", "--out", str(out)], check=True)
     return known_runs(out)
+
+
+def picture(capture: Path, out: Path, target: Path) -> None:
+    """Normals and errors of the methods in PICTURED, as a JPEG."""
+    truth = read_truth(capture).normals
+    found = {name: read_reconstruction(out / name) for name in PICTURED if (out / name).is_dir()}
+    view = next(iter(truth))
+    box = cropped(truth[view])
+    maps = {name: result.normal_maps[result.views.index(view)][box] for name, result in found.items()}
+    cv2.imwrite(str(target), side_by_side(truth[view][box], maps)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 def error(run: Run, key: str, digits: int = 2) -> str:
@@ -84,15 +100,15 @@ def claims(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> list[list[str
 
 
 def verdict(runs: Runs) -> str:
-    """Where a method that is not ours wins."""
+    """Which method has the lowest errors, and where a published one is faster than ours of the same accuracy."""
     lines = []
     for key in MEASURES:
-        best = min((run for run in runs.values() if key in run.errors), key=lambda run: run.errors[key])
-        lines.append(f"lowest {key}: {best.method} ({best.errors[key]:.3f})")
+        best = sorted((run for run in runs.values() if key in run.errors), key=lambda run: run.errors[key])[:3]
+        lines.append(f"lowest {key}: " + ", ".join(f"{run.method} {run.errors[key]:.3f}" for run in best))
         for name, is_dominated in dominated(points_of([r for r in runs.values() if r.method in (*BUDGETS, *PUBLISHED)], key)).items():
             if not is_dominated:
-                lines.append(f"{name} is faster than any of ours that is as accurate ({key})")
-    return "; ".join(lines) + "."
+                lines.append(f"{name} is faster than all of ours that are as accurate ({key})")
+    return "\n".join(f"- {line}" for line in lines)
 
 
 def page(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> str:
@@ -103,6 +119,7 @@ def page(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> str:
         chosen = [of_capture[method] for method in METHODS if method in of_capture]
         parts += [f"## {name}", as_markdown(rows(chosen)), verdict({run.method: run for run in chosen if not run.failed})]
         parts += [f"![{key} against time]({name}_{key}.svg)" for key in MEASURES]
+        parts.append(f"Normals of the first view, below their errors, 0 to 30 degrees:\n\n![normals]({name}_normals.jpg)")
     return "\n\n".join(parts) + "\n"
 
 
@@ -121,6 +138,7 @@ def main() -> None:
     names = given.names or CAPTURES
     runs = {name: compared(given.captures / name, given.out / name) for name in names}
     for name in names:
+        picture(given.captures / name, given.out / name, DOCS / f"{name}_normals.jpg")
         for key in MEASURES:
             shutil.copyfile(given.out / name / f"curve_{key}.svg", DOCS / f"{name}_{key}.svg")
     found = HERE / "sweeps.json"
