@@ -21,7 +21,7 @@ class Parts:
     shadows      cast shadows are traced
     one_rig      lights that stand still with the camera are looked for
     free_lights  lights are refined after their first estimate
-    moves        vertices move, to where views agree
+    moves        vertices move in the last rounds, to where views agree; without, the surface is Stage I's (`draft`: the hull)
     edges        of the meshes, over those of the preset: a budget
     """
 
@@ -39,7 +39,9 @@ class Parts:
 
     def of(self, plan: RefineSettings) -> RefineSettings:
         """The plan with these parts alone."""
-        rounds = tuple(replace(one, edge=one.edge * self.edges, fusions=one.fusions if self.moves else 0) for one in plan.rounds)
+        rounds = tuple(
+            replace(one, edge=one.edge * self.edges, fusions=one.fusions if self.moves or not plan.final else 0) for one in plan.rounds
+        )
         return replace(plan, rounds=rounds, free_lights=plan.free_lights and self.free_lights, model=self.model)
 
 
