@@ -147,13 +147,12 @@ METHODS = {
     "no-neural": Method("ours without a neural residual", _ablation(_no_neural)),
     "calibrated": Method("ours with the true lights", _ours("standard"), calibrated=True),
     "draft-2x": Method("preset draft with edges twice as long", _ours("draft", _with(edges=2.0))),
-    "draft-1.4x": Method("preset draft with edges 1.4 times as long", _ours("draft", _with(edges=1.4))),
-    "standard-2x": Method("preset standard with edges twice as long", _ours("standard", _with(edges=2.0))),
+    "draft-0.7x": Method("preset draft with edges 0.7 times as long", _ours("draft", _with(edges=0.7))),
     "standard-1.4x": Method("preset standard with edges 1.4 times as long", _ours("standard", _with(edges=1.4))),
 }
 """By the name that --method and --methods take."""
 
-BUDGETS = ("draft-2x", "draft-1.4x", "ours-draft", "standard-2x", "standard-1.4x", "ours", "ours-fine")
+BUDGETS = ("draft-2x", "ours-draft", "draft-0.7x", "standard-1.4x", "ours", "ours-fine")
 """Ours as its budget grows, for the curve of error against time."""
 
 

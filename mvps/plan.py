@@ -40,7 +40,14 @@ class Parts:
     def of(self, plan: RefineSettings) -> RefineSettings:
         """The plan with these parts alone."""
         rounds = tuple(
-            replace(one, edge=one.edge * self.edges, fusions=one.fusions if self.moves or not plan.final else 0) for one in plan.rounds
+            replace(
+                one,
+                edge=one.edge * self.edges,
+                # The same curvature, seen over a longer edge.
+                crease=one.crease * self.edges,
+                fusions=one.fusions if self.moves or not plan.final else 0,
+            )
+            for one in plan.rounds
         )
         return replace(plan, rounds=rounds, free_lights=plan.free_lights and self.free_lights, model=self.model)
 

@@ -32,7 +32,7 @@ class Round:
     fusions: int
 
 
-ROUNDS = (Round(3.0, 4.0, 0.5, 4), Round(2.0, 2.0, 0.5, 2), Round(1.5, 1.5, 0.5, 2))
+ROUNDS = (Round(3.0, 4.0, 0.5, 4), Round(2.0, 2.0, 0.5, 2), Round(1.5, 1.5, 0.5, 1), Round(1.0, 1.0, 0.5, 2))
 """From the hull, a few pixels off, to faces that hold what the pixels' azimuths do. A vertex that has to go farther than its reach goes on
 in the next fusion."""
 
