@@ -165,9 +165,8 @@ def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
     with progress.stage("load"):
         capture = read_capture(path, settings.views or None, settings.lights or None)
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    calibrated = settings.calibrated_lights or method.calibrated
-    lights = read_calibrated_lights(path, used) if calibrated else None
-    made = method.run(capture, replace(settings, calibrated_lights=calibrated), lights, progress)
+    lights = read_calibrated_lights(path, used) if method.calibrated else None
+    made = method.run(capture, replace(settings, calibrated_lights=method.calibrated), lights, progress)
     metrics = {**made.metrics, "stages": progress.stages}
     write_reconstruction(replace(made, metrics=metrics, settings={**made.settings, "method": name}), out)
 
