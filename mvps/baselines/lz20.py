@@ -8,7 +8,8 @@ Materials", IEEE Transactions on Image Processing 29, 2020; before it Zhou, Wu a
     depths carried along iso-depth contours, fusion  lz20_contours.py, lz20_surface.py
     mixture of basis BRDFs                           lz20_brdf.py
 
-Written from the method as published; no code of the authors was at hand, and all constants are this module's. What departs from them:
+Written from the abstracts and from what is known of the method, without the full texts or the authors' code; all constants are this
+module's. What departs from them, as far as that says:
 
 Lights     Theirs stand on rings about the camera, so that mirrored lights exist; near lights are allowed for. Here lights are directional
            and stand anywhere: the mirrored light's observation is interpolated, a robust linear fit plus the other lights' residuals.

@@ -8,7 +8,7 @@ makes a fine mesh that follows the normals and stays near the coarse mesh. From 
 
     visual hull -> [ parameter domain -> lights -> texel normals -> displacement ]  per level  -> domain, lights, normals once more
 
-Departures from the paper:
+Written from the abstracts and from what is known of the method, without the full text. Departures from the paper, as far as that says:
 
 - Coarse mesh: the visual hull of the masks (theirs: structure from motion and multiview stereo). What is added because of it, hollows that
   let go of the hull and outlines that hold to the masks, stands in pj16_displacement.py.
