@@ -188,7 +188,7 @@ def _photographed_albedo(
         view, direction, intensity = capture.views[i], lights.direction[i], lights.intensity[i]
         arriving = light_arriving(sources, material, direction)
         hit, albedo, known = pixel_albedo(caster, material, view, direction, intensity, arriving)
-        known &= _away_from_border(view)
+        known &= away_from_border(view)
         parts = []
         for start in range(0, len(position), TEXELS_PER_CHUNK):
             part = slice(start, start + TEXELS_PER_CHUNK)
@@ -205,7 +205,7 @@ def _photographed_albedo(
     return total, known
 
 
-def _away_from_border(view: View) -> Bool:
+def away_from_border(view: View) -> Bool:
     """(pixels,) False where one of the eight neighbours is background: such a pixel may be mixed with it."""
     inner = cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
     away: Bool = inner[view.mask] > 0

@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
@@ -23,8 +22,9 @@ from mvps.calibrate import colour_ratios
 from mvps.camera import bilinear, footprint, inside_image, project, view_directions
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise, vertex_normals
-from mvps.scene import Bool, Capture, Float, Int, Surface, View
+from mvps.scene import Capture, Float, Int, Surface, View
 from mvps.silhouette import sampled
+from mvps.texture import away_from_border
 from mvps.visibility import RayCaster, camera_hits, interpolate, ray_caster
 
 STEEPEST_VIEW = 0.2
@@ -103,7 +103,7 @@ def warped(domain: Domain, capture: Capture) -> Warped:
 def _warp(domain: Domain, caster: RayCaster, view: View) -> tuple[sp.csr_matrix, NDArray[np.float32]]:
     hits = camera_hits(caster, view.camera, view.pixels)
     met = interpolate(caster.surface, hits, caster.surface.vertices)
-    reliable = (hits.face >= 0) & _away_from_border(view)
+    reliable = (hits.face >= 0) & away_from_border(view)
     cosine = np.einsum("ni,ni->n", domain.normal, view_directions(view.camera, domain.position))
     chosen = np.flatnonzero(cosine > STEEPEST_VIEW)
     image, depth = project(view.camera, domain.position[chosen])
@@ -123,10 +123,3 @@ def _warp(domain: Domain, caster: RayCaster, view: View) -> tuple[sp.csr_matrix,
     facing = np.zeros(len(domain.position), np.float32)
     facing[chosen] = cosine[chosen]
     return matrix, facing
-
-
-def _away_from_border(view: View) -> Bool:
-    """(pixels,) False where one of the eight neighbours is background: such a pixel may be mixed with it."""
-    inner = cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    away: Bool = inner[view.mask] > 0
-    return away
