@@ -1,0 +1,1 @@
+"""Captures that are hard: scenes.py before the photographs are taken, damage.py after, cases.py the table of them."""

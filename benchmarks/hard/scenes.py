@@ -1,0 +1,178 @@
+"""Scenes that are hard: few or odd lights, odd materials, odd shapes, cameras that cut the object, lights that are near.
+
+A scene is that of mvps.synthetic with one part replaced. Lengths are in units of half the extent; the object then fills the ball of
+radius 1, of which a radius is seen as 0.45 of the image's width at most.
+
+Near light   a point light at p = distance * direction from the object's centre, as strong there as the directional one it replaces:
+             the light at x comes along (p - x) / |p - x| and is distance^2 / |p - x|^2 times as strong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from mvps.camera import view_directions
+from mvps.mesh import normalise, vertex_normals
+from mvps.rendering import Arriving, points_under, shaded
+from mvps.scene import Camera, Capture, Float, Int, Lights, Material, Surface, Truth
+from mvps.synthetic.scene import Photograph, Scene, make_cameras, make_lights, make_scene, render_capture
+from mvps.synthetic.settings import SceneSettings
+from mvps.synthetic.shape import make_material
+from mvps.visibility import RayCaster
+
+BASE = SceneSettings(views=8, lights=10, size=128)
+
+Change = Callable[[Scene], Scene]
+
+
+def rendered(settings: SceneSettings = BASE, change: Change | None = None, take: Photograph | None = None) -> tuple[Capture, Truth]:
+    """The settings' scene, changed, photographed."""
+    scene = make_scene(settings)
+    return render_capture(settings, scene if change is None else change(scene), take)
+
+
+# ------------------------------------------------------------------------------------------------ lights
+
+
+def lit(scene: Scene, direction: Float, intensity: Float) -> Scene:
+    """Under one rig of lights: direction (lights, 3) in DiLiGenT's camera frame (x right, y up, z to the camera), intensity (lights, 3)."""
+    in_camera = normalise(direction) * (1, -1, -1)
+    lights = Lights(tuple(in_camera @ c.rotation for c in scene.cameras), (intensity / intensity.mean(),) * len(scene.cameras), True)
+    return replace(scene, lights=lights)
+
+
+def in_one_plane(scene: Scene) -> Scene:
+    """Lights along an arc from 50 degrees left to 50 degrees right, all in the plane y = 0 of the camera."""
+    intensity = scene.lights.intensity[0]
+    angle = np.radians(np.linspace(-50, 50, len(intensity)))
+    return lit(scene, np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], -1), intensity)
+
+
+def unequal(scene: Scene, ratio: float) -> Scene:
+    """The strongest light `ratio` times as strong as the weakest, evenly spaced in the logarithm."""
+    count = len(scene.lights.intensity[0])
+    steps = np.random.default_rng(0).permutation(count) / (count - 1)
+    intensity = np.repeat(ratio ** steps[:, None], 3, 1)
+    return replace(scene, lights=replace(scene.lights, intensity=(intensity / intensity.mean(),) * len(scene.cameras)))
+
+
+def coloured(scene: Scene) -> Scene:
+    """Red, green, blue, yellow ... lights: every channel between 0.1 and 1."""
+    intensity = np.random.default_rng(0).uniform(0.1, 1, scene.lights.intensity[0].shape)
+    return replace(scene, lights=replace(scene.lights, intensity=(intensity / intensity.mean(),) * len(scene.cameras)))
+
+
+def near(distance: float) -> Photograph:
+    """Photographs under point lights this far (world units) from the world's origin, in the directions of the scene's lights."""
+
+    def take(
+        caster: RayCaster,
+        material: Material,
+        camera: Camera,
+        pixels: Int,
+        direction: Float,
+        intensity: Float,
+        arriving: Arriving | None = None,
+    ) -> NDArray[np.float32]:
+        points = points_under(caster, material, camera, pixels)
+        view = view_directions(camera, points.position)
+        image = np.zeros((len(pixels), len(direction), 3), np.float32)
+        for k, towards in enumerate(direction):
+            path = distance * towards - points.position
+            light, falloff = normalise(path), distance**2 / (path**2).sum(-1)
+            free = ~caster.occluded(points.position + caster.offset * points.mesh_normal, light)
+            image[:, k] = shaded(points, view, material, light[:, None])[:, 0]
+            image[:, k] *= (free * falloff * points.hit)[:, None]
+        return image * intensity.astype(np.float32)
+
+    return take
+
+
+# ------------------------------------------------------------------------------------------------ materials
+
+
+def made_of(scene: Scene, albedo: float | None, weight: tuple[float, ...] | None = None, sharpness: tuple[float, ...] = ()) -> Scene:
+    """Albedo times a factor (None: as it is) that makes its mean so; lobes of one weight everywhere (None: as they are)."""
+    material = scene.material
+    if albedo is not None:
+        material = replace(material, albedo=material.albedo * (albedo / material.albedo.mean()))
+    if weight is not None:
+        weights = np.tile(np.array(weight), (len(material.albedo), 1))
+        material = replace(material, specular_weight=weights, sharpness=np.array(sharpness))
+    return replace(scene, material=material)
+
+
+# ------------------------------------------------------------------------------------------------ shapes
+
+
+def shaped_as(surface: Surface, settings: SceneSettings = BASE) -> Scene:
+    """The settings' scene with another object: its ball (radius 1 around the origin) gets the settings' extent."""
+    material_rng, light_rng = (np.random.default_rng((settings.seed, part)) for part in (1, 2))
+    material = make_material(surface.vertices, vertex_normals(surface), settings.strength, material_rng)
+    vertices = surface.vertices * settings.extent / 2
+    cameras = make_cameras(settings, vertices)
+    return Scene(Surface(vertices, surface.faces), material, cameras, make_lights(settings, cameras, light_rng))
+
+
+def surface_of(*parts: trimesh.Trimesh) -> Surface:
+    """Parts that may overlap as one surface, centred and scaled into the unit ball; edges of 0.03 (2 pixels of BASE) at most."""
+    whole = trimesh.util.concatenate([part.subdivide_to_size(0.03, max_iter=20) for part in parts])
+    middle = whole.bounds.mean(0)
+    radius = np.linalg.norm(whole.vertices - middle, axis=-1).max()
+    return Surface((whole.vertices - middle) / radius, whole.faces)
+
+
+def sphere() -> Surface:
+    """A ball."""
+    return surface_of(trimesh.creation.icosphere(subdivisions=5))
+
+
+def slab() -> Surface:
+    """A plate on its narrow side, a tenth as thick as wide."""
+    return surface_of(trimesh.creation.box((1.6, 0.16, 1.2)))
+
+
+def bowl() -> Surface:
+    """A bowl as deep as wide, open to the top, its wall a tenth of its radius thick."""
+    angle, height = np.linspace(-np.pi / 2, 0, 64), np.linspace(0, 1, 40)[1:]
+    outside = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], -1), np.stack([np.ones_like(height), height], -1)])
+    inside = outside * (0.9, 1) + np.where(outside[:, 1:] < 0, -0.1 * outside * (0, 1), 0)
+    outline = np.concatenate([outside, inside[::-1]])
+    # The axis is met twice, below and inside: a revolution wants radius 0 there.
+    outline[[0, -1], 0] = 0
+    return surface_of(trimesh.creation.revolve(outline, sections=240))
+
+
+def touching() -> Surface:
+    """Two balls side by side that touch."""
+    balls = [trimesh.creation.icosphere(subdivisions=5, radius=0.505) for _ in range(2)]
+    for ball, x in zip(balls, (-0.5, 0.5), strict=True):
+        ball.apply_translation((x, 0, 0))
+    return surface_of(*balls)
+
+
+def rods(width: float, size: int = BASE.size) -> Surface:
+    """A ball with eight rods, this many pixels of an image of `size` pixels wide and 0.4 of the object's radius long."""
+    radius = width / (0.9 * size)
+    parts = [trimesh.creation.icosphere(subdivisions=5, radius=0.6)]
+    for k in range(8):
+        azimuth, height = 2 * np.pi * k / 8, (-0.5, 0.4)[k % 2]
+        towards = normalise(np.array([np.cos(azimuth), np.sin(azimuth), height]))
+        parts.append(trimesh.creation.cylinder(radius, sections=16, segment=(0.5 * towards, towards)))
+    return surface_of(*parts)
+
+
+# ------------------------------------------------------------------------------------------------ cameras
+
+
+def zoomed(scene: Scene, factor: float) -> Scene:
+    """Focal lengths times a factor: with more than 1.11 the images cut the object."""
+    cameras = tuple(
+        replace(c, K=np.diag([factor, factor, 1.0]) @ c.K + (1 - factor) * c.K * [[0, 0, 1], [0, 0, 1], [0, 0, 0]]) for c in scene.cameras
+    )
+    return replace(scene, cameras=cameras)
