@@ -1,0 +1,168 @@
+"""python -m mvps.view RESULT: a page in the browser with the model, to turn and to light, with exact shadows.
+
+The page is the viewer of viewer/ served from this machine alone; for every light that the mouse asks for, Embree traces which vertices it
+reaches. With --capture the photographs stand beside: one is chosen, and the model takes its camera and its light.
+"""
+
+from __future__ import annotations
+
+from argparse import SUPPRESS
+from collections.abc import Callable, Sequence
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qs, urlsplit
+
+from mvps.command import parse, parser, run
+from mvps.scene import CaptureError
+
+if TYPE_CHECKING:
+    from mvps.scene import Capture, Reconstruction
+
+Answer = tuple[str, bytes]
+"""A type of content, and the content."""
+
+
+class Model:
+    """What the server knows: the page, shadows, photographs."""
+
+    def __init__(self, result: Reconstruction, capture: Capture | None) -> None:
+        from mvps.visibility import ray_caster
+
+        self._result, self._capture = result, capture
+        self._caster = ray_caster(result.surface)
+        self._views = {} if capture is None else {view.name: view for view in capture.views if view.name in result.views}
+
+    def page(self, _: str) -> Answer:
+        """The viewer, with a list of photographs where there is a capture."""
+        import numpy as np
+
+        from mvps.report.page import STYLE as PAGE_STYLE
+        from mvps.viewer import STYLE, viewer_html
+
+        towards, up = np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0])
+        if self._views:
+            first = next(iter(self._views.values())).camera
+            towards, up = -first.rotation[2], -first.rotation[1]
+        part = viewer_html(self._result.surface, self._result.material, up, towards, served=True)
+        body = f"{part}\n{self._photographs()}"
+        head = (
+            f'<head><meta charset="utf-8"><link rel="icon" href="data:,"><title>mvps.view</title><style>{PAGE_STYLE}{STYLE}</style></head>'
+        )
+        return "text/html; charset=utf-8", f'<!DOCTYPE html>\n<html lang="en">{head}<body>{body}</body></html>'.encode()
+
+    def _photographs(self) -> str:
+        if not self._views:
+            return ""
+        result = self._result
+        options = []
+        for name, view in self._views.items():
+            place = result.views.index(name)
+            for number in view.lights:
+                if number not in result.light_names[place]:
+                    continue
+                light = result.lights.direction[place][result.light_names[place].index(number)]
+                said = ";".join(",".join(f"{x:.6f}" for x in v) for v in (-view.camera.rotation[2], light))
+                options.append(f'<option value="{name}/{number}|{said}">{name}, light {number}</option>')
+        return (
+            f'<p><label>Photograph <select id="photograph">{"".join(options)}</select></label></p>'
+            '<img id="beside" alt="the photograph" style="max-width:24rem">'
+            "<script>(() => { const list = document.getElementById('photograph');"
+            "const show = () => { const [name, said] = list.value.split('|');"
+            "document.getElementById('beside').src = 'photograph?of=' + name;"
+            "const [from, light] = said.split(';').map((v) => v.split(',').map(Number));"
+            "if (window.mvpsViewer) { window.mvpsViewer.look(from); window.mvpsViewer.lightFrom(light); } };"
+            "list.addEventListener('input', show); show(); })();</script>"
+        )
+
+    def shadow(self, query: str) -> Answer:
+        """A byte per vertex, 255 where the light of ?light=x,y,z reaches it. CaptureError where that is no direction."""
+        import numpy as np
+
+        from mvps.visibility import shadows
+
+        try:
+            light = np.array([float(word) for word in parse_qs(query)["light"][0].split(",")])
+        except (KeyError, ValueError):
+            light = np.zeros(0)
+        if light.shape != (3,) or not np.isfinite(light).all() or not light.any():
+            raise CaptureError(f"light: wanted three numbers, given {query!r}")
+        surface = self._result.surface
+        hidden = shadows(self._caster, surface.vertices, self._caster.vertex_normals, light[None] / np.linalg.norm(light))[:, 0]
+        return "application/octet-stream", np.where(hidden, 0, 255).astype(np.uint8).tobytes()
+
+    def photograph(self, query: str) -> Answer:
+        """A photograph, ?of=view_04/7, as a JPEG for the screen. CaptureError where there is none."""
+        import cv2
+        import numpy as np
+
+        from mvps.pbr import srgb_bytes
+
+        name, _, number = (parse_qs(query).get("of") or [""])[0].partition("/")
+        view = self._views.get(name)
+        if view is None or not number.isdecimal() or int(number) not in view.lights:
+            raise CaptureError(f"of: wanted a photograph such as {next(iter(self._views), 'view_01')}/1, given {query!r}")
+        image = np.zeros((*view.mask.shape, 3))
+        image[view.mask] = view.radiance([view.lights.index(int(number))])[:, 0]
+        shown = srgb_bytes(image / max(float(np.quantile(image[view.mask], 0.99)), 1e-12))
+        return "image/jpeg", cv2.imencode(".jpg", np.ascontiguousarray(shown[..., ::-1]))[1].tobytes()
+
+
+def server(model: Model, port: int) -> ThreadingHTTPServer:
+    """A server of the model on this machine's own address; port 0: any free one. OSError where the port is taken."""
+    pages: dict[str, Callable[[str], Answer]] = {"/": model.page, "/shadow": model.shadow, "/photograph": model.photograph}
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            address = urlsplit(self.path)
+            if address.path not in pages:
+                self.send_error(404)
+                return
+            try:
+                kind, content = pages[address.path](address.query)
+            except CaptureError as error:
+                self.send_error(400, str(error)[:200].encode("ascii", "replace").decode())
+                return
+            self.send_response(200)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(content)))
+            self.end_headers()
+            self.wfile.write(content)
+
+        def log_message(self, format: str, *values: object) -> None:
+            """Nothing: every move of the mouse asks for something."""
+
+    return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    made = parser("mvps.view", "Show a result in the browser: turn the model, move the light, with exact shadows. Ends with Ctrl-C.")
+    made.add_argument("result", type=Path, metavar="RESULT", help="folder that mvps.reconstruct wrote")
+    made.add_argument("--capture", type=Path, default=SUPPRESS, metavar="CAPTURE", help="folder of the photographs, to stand beside")
+    made.add_argument("--port", type=int, default=8080, help="of the page's address; 0: any free one")
+    made.add_argument("--no-browser", action="store_true", help="print the address only")
+    given = parse(made, argv)
+    if not 0 <= given.port < 65536:
+        raise CaptureError(f"--port: wanted a number from 0 to 65535, given {given.port}")
+    import webbrowser
+
+    from mvps.export import read_reconstruction
+    from mvps.load import read_capture
+
+    result = read_reconstruction(given.result)
+    model = Model(result, read_capture(given.capture) if "capture" in given else None)
+    try:
+        serving = server(model, given.port)
+    except OSError as error:
+        raise CaptureError(f"--port {given.port}: wanted a free one, given {error.strerror}; choose another --port") from error
+    with serving:
+        address = f"http://127.0.0.1:{serving.server_port}/"
+        print(f"{address}  (Ctrl-C ends)", flush=True)
+        if not given.no_browser:
+            webbrowser.open(address)
+        serving.serve_forever()
+
+
+if __name__ == "__main__":
+    raise SystemExit(run(main))

@@ -1,0 +1,116 @@
+"""A model to turn and to light, as a part of a page: a canvas, its controls, the model's data and the program that shows it.
+
+The browser's graphics processor evaluates the same image model (shading.py) for every pixel,
+
+    radiance = sum over lights of  E * visibility * (albedo D(n . l) D(n . v) + sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0),
+
+with normal, albedo and weights interpolated between vertices. Visibility comes from who shows the page: exactly, traced by Embree for every
+vertex (mvps.view), or from a picture of depths as the light sees them (a page without a server).
+
+Data, one array after the other, compressed by deflate (RFC 1950), written in base64:
+
+    position  (V, 3) uint16   over the box from low to high        normal  (V, 3) int16 over 32767
+    albedo    (V, 3) uint8    square root, over `white`            weight  (V, 4) uint8 square root, over `lobe_white`, 0 beyond the lobes
+    other     (V, 2) uint8    confidence; visibility at first      faces   (F, 3) uint32
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.scene import Float, Material, Surface
+
+MOST_LOBES = 4
+"""As many as a vertex attribute holds; the model chooses from three."""
+
+LARGEST_BYTES = 9_000_000
+"""Of the compressed data: a page of 15 MB holds a third more in base64 and the pictures besides."""
+
+
+@cache
+def program() -> str:
+    """The viewer's JavaScript."""
+    return (Path(__file__).parent / "viewer.js").read_text(encoding="utf-8")
+
+
+def _root_bytes(values: Float, white: Float | float) -> NDArray[np.uint8]:
+    """Square roots of values over white, as bytes: dark ones keep their digits."""
+    coded: NDArray[np.uint8] = np.rint(255 * np.sqrt(np.clip(values / np.maximum(white, 1e-12), 0, 1))).astype(np.uint8)
+    return coded
+
+
+def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]:
+    """What the program must know of the model, as JSON values, and its compressed arrays.
+
+    Lobes beyond MOST_LOBES, which an edited material may have, are left out, the faintest first.
+    """
+    low, high = surface.vertices.min(0), surface.vertices.max(0)
+    span = np.maximum(high - low, 1e-300)
+    weight = material.specular_weight if material.specular_weight.ndim == 3 else material.specular_weight[..., None].repeat(3, 2)
+    kept = np.sort(np.argsort(-weight.sum((0, 2)), kind="stable")[:MOST_LOBES])
+    weight, sharpness = weight[:, kept], material.sharpness[kept]
+    total = weight.sum(0)
+    # The colour of a lobe is one for the object (joint/colours.py).
+    tint = np.where(total.sum(1, keepdims=True) > 0, 3 * total / np.maximum(total.sum(1, keepdims=True), 1e-300), 1.0)
+    grey = np.zeros((len(surface.vertices), MOST_LOBES))
+    grey[:, : len(kept)] = weight.mean(2)
+    white, lobe_white = float(np.quantile(material.albedo, 0.999)) or 1.0, np.maximum(grey.max(0), 1e-12)
+    arrays = (
+        np.rint(65535 * (surface.vertices - low) / span).astype("<u2"),
+        np.rint(32767 * material.normal).astype("<i2"),
+        _root_bytes(material.albedo, white),
+        _root_bytes(grey, lobe_white),
+        np.stack([np.rint(255 * material.confidence), np.full(len(grey), 255)], 1).astype(np.uint8),
+        surface.faces.astype("<u4"),
+    )
+    about = {
+        "vertices": len(surface.vertices),
+        "faces": len(surface.faces),
+        "low": low.tolist(),
+        "high": high.tolist(),
+        "white": white,
+        "lobe_white": lobe_white.tolist(),
+        "sharpness": [*sharpness.tolist(), *[1.0] * (MOST_LOBES - len(kept))],
+        "tint": [*tint.tolist(), *[[1.0] * 3] * (MOST_LOBES - len(kept))],
+        "grazing": material.grazing,
+        "microfacet": material.microfacet,
+    }
+    return about, zlib.compress(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), 6)
+
+
+def viewer_html(surface: Surface, material: Material, up: Float, looking_from: Float, served: bool = False) -> str:
+    """The part of a page; up, looking_from (3,): upwards and towards the first camera, world frame. served: visibility is asked of the
+    server that the page came from. A sentence in its place where the model is too large for a page."""
+    about, data = packed(surface, material)
+    if len(data) > LARGEST_BYTES and not served:
+        return f"<p>The model of {len(surface.vertices):,} vertices is too large for this page; model.glb shows it.</p>"
+    about |= {"up": np.asarray(up).tolist(), "from": np.asarray(looking_from).tolist(), "served": served}
+    options = "".join(f"<option>{escape(name)}</option>" for name in ("image", "albedo", "highlights", "normals", "confidence"))
+    return (
+        '<div class="viewer"><canvas id="viewer" tabindex="0" aria-label="The model: drag to turn it, drag with the right button or'
+        ' with Shift to move the light, scroll to come closer; arrow keys turn it, with Shift they move the light"></canvas>'
+        '<p class="viewer-controls"><label>Show <select id="viewer-layer">' + options + "</select></label> "
+        '<label>Drag <select id="viewer-drag"><option value="turn">turns the object</option><option value="light">moves the light</option>'
+        '</select></label> <label>Fill light <input id="viewer-fill" type="range" min="0" max="1" step="0.05" value="0.1"></label> '
+        '<label>Exposure <input id="viewer-exposure" type="range" min="-2" max="3" step="0.1" value="0.5"></label></p>'
+        '<p id="viewer-said" role="status"></p></div>\n'
+        f'<script type="application/json" id="viewer-about">{json.dumps(about)}</script>\n'
+        f'<script type="text/plain" id="viewer-data">{base64.b64encode(data).decode("ascii")}</script>\n'
+        f"<script>{program()}</script>"
+    )
+
+
+STYLE = (
+    ".viewer canvas{width:100%;max-width:48rem;aspect-ratio:4/3;background:#222;touch-action:none;display:block;cursor:grab}"
+    ".viewer-controls label{margin-right:1.2em;white-space:nowrap}"
+)
+"""Of the part, for the page's style sheet."""

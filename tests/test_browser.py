@@ -1,0 +1,105 @@
+"""The viewer in a browser: it draws, the picture changes when light or object move, and nothing is said on the console."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from sphere_scene import SphereScene, make_sphere
+
+from mvps.report import report_html
+from mvps.view import Model, server
+
+pytestmark = pytest.mark.browser
+
+Opened = Callable[[str], tuple[Any, list[str]]]
+
+OPTIONS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-background-networking",
+]
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    return make_sphere(4)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=OPTIONS)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Opened]:
+    """A page of an address, and what it has said on its console."""
+    pages = []
+
+    def open_(address: str) -> tuple[Any, list[str]]:
+        page, said = browser.new_page(viewport={"width": 700, "height": 700}), []
+        pages.append(page)
+        page.on("console", lambda message: said.append(message.text) if message.type in ("error", "warning") else None)
+        page.on("pageerror", lambda error: said.append(str(error)))
+        page.goto(address)
+        page.wait_for_function("Number(document.getElementById('viewer').dataset.drawn || 0) > 0")
+        return page, said
+
+    yield open_
+    for page in pages:
+        page.close()
+
+
+def shown(page: Any) -> np.ndarray:
+    """The canvas once it has drawn what was asked for."""
+    page.wait_for_timeout(300)
+    data = page.locator("#viewer").screenshot()
+    image: np.ndarray = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).astype(float)
+    return image
+
+
+def test_the_report_shows_the_model_without_a_server(
+    scene: SphereScene, tmp_path: Path, opened: Callable[[str], tuple[Any, list[str]]]
+) -> None:
+    path = tmp_path / "report.html"
+    path.write_text(report_html(scene.reconstruction, scene.capture), encoding="utf-8")
+    page, said = opened(path.as_uri())
+    first = shown(page)
+    middle = first[first.shape[0] // 2, first.shape[1] // 2]
+    assert middle.max() > 60 and first[3, 3].max() < 40
+    page.locator("#viewer").focus()
+    for _ in range(6):
+        page.keyboard.press("Shift+ArrowLeft")
+    lit = shown(page)
+    assert np.abs(lit - first).mean() > 2
+    page.locator("#viewer").drag_to(page.locator("#viewer"), source_position={"x": 100, "y": 100}, target_position={"x": 220, "y": 100})
+    assert np.abs(shown(page) - lit).mean() > 1
+    page.select_option("#viewer-layer", "normals")
+    assert np.abs(shown(page) - lit).mean() > 5
+    assert not said
+
+
+def test_the_server_s_page_has_exact_shadows_and_photographs(scene: SphereScene, opened: Opened) -> None:
+    with server(Model(scene.reconstruction, scene.capture), 0) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        page, said = opened(f"http://127.0.0.1:{serving.server_port}/")
+        page.wait_for_function("Number(document.getElementById('viewer').dataset.traced || 0) > 0")
+        first = shown(page)
+        page.select_option("#photograph", index=15)
+        page.wait_for_function("document.getElementById('beside').naturalWidth > 0")
+        assert np.abs(shown(page) - first).mean() > 2
+        serving.shutdown()
+    assert not said

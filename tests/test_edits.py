@@ -1,0 +1,97 @@
+"""mvps.edits: what a file of edits does to a material, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from sphere_scene import make_sphere
+
+from mvps.edits import clusters, edited, read_edits, turned_hue
+from mvps.pbr import reflectance_scale, specular_energy
+from mvps.scene import CaptureError, Material
+
+SCENE = make_sphere(3)
+SURFACE, MATERIAL = SCENE.reconstruction.surface, SCENE.reconstruction.material
+CAMERAS = {view.name: view.camera for view in SCENE.capture.views}
+
+
+def after(*edits: dict[str, Any]) -> Material:
+    return edited(SURFACE, MATERIAL, edits, CAMERAS)
+
+
+def test_albedo_by_colour_factor_and_hue() -> None:
+    white = reflectance_scale(MATERIAL)
+    np.testing.assert_allclose(
+        after({"albedo": {"colour": [0.2, 0.4, 0.6]}}).albedo, np.tile([0.2, 0.4, 0.6], (len(MATERIAL.albedo), 1)) * white
+    )
+    np.testing.assert_allclose(after({"albedo": {"factor": [2, 1, 0]}}).albedo, MATERIAL.albedo * (2, 1, 0))
+    np.testing.assert_allclose(
+        turned_hue(np.array([[0.8, 0.1, 0.1], [0.3, 0.3, 0.3]]), 120), [[0.1, 0.8, 0.1], [0.3, 0.3, 0.3]], atol=1e-12
+    )
+
+
+def test_sharper_highlights_keep_their_energy() -> None:
+    sharper = after({"specular": {"sharpness_factor": 4}})
+    before, then = (specular_energy(m.specular_weight, m.sharpness) for m in (MATERIAL, sharper))
+    np.testing.assert_allclose(then, before)
+    assert sharper.sharpness.tolist() == [12, 60, 48, 240] and not sharper.specular_weight[:, :2].any()
+    np.testing.assert_allclose(after({"specular": {"factor": 0.5}}).specular_weight, MATERIAL.specular_weight / 2)
+
+
+def test_a_preset_reflects_what_it_says() -> None:
+    gold = after({"preset": "gold"})
+    white = reflectance_scale(MATERIAL)
+    np.testing.assert_allclose(
+        specular_energy(gold.specular_weight, gold.sharpness), np.tile([1.0, 0.78, 0.34], (len(gold.albedo), 1)) * white
+    )
+    assert not gold.albedo.any() and not after({"preset": "matte"}).specular_weight.any()
+
+
+def test_a_painted_region_is_what_its_camera_sees(tmp_path: Path) -> None:
+    view = SCENE.capture.views[0]
+    mask = np.zeros(view.mask.shape, np.uint8)
+    mask[:, 48:] = 255
+    cv2.imwrite(str(tmp_path / "half.png"), mask)
+    path = tmp_path / "edits.json"
+    path.write_text(json.dumps({"edits": [{"region": {"view": "view_01", "mask": "half.png"}, "albedo": {"factor": 0}}]}))
+    black = ~edited(SURFACE, MATERIAL, read_edits(path), CAMERAS).albedo.any(1)
+    local = SURFACE.vertices @ view.camera.rotation.T
+    assert black.any() and (local[black, 0] >= 0).all() and (local[black, 2] < 0).all()
+    assert black.mean() == pytest.approx(0.25, abs=0.06)
+
+
+def test_kinds_of_material_are_found_from_the_weights() -> None:
+    shiny = SURFACE.vertices[:, 2] > 0
+    material = replace(MATERIAL, albedo=np.ones_like(MATERIAL.albedo), specular_weight=np.where(shiny[:, None], [0.5, 0.5], [0.05, 0.0]))
+    assert ((clusters(material, 2) == 1) == shiny).all()
+    changed = edited(SURFACE, material, [{"region": {"cluster": 2, "of": 2}, "albedo": {"factor": 0.5}}], {})
+    assert ((changed.albedo[:, 0] < 1) == shiny).all()
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        ({"preset": "velvet"}, "preset one of matte"),
+        ({"albedo": {"colour": [1, -1, 0]}}, "numbers of 0 and more"),
+        ({"albedo": {"shade": 3}}, "unexpected keyword"),
+        ({"specular": {"sharpness_factor": 0}}, "sharpness_factor above 0"),
+        ({"region": {"view": "view_77", "mask": "x.png"}, "preset": "gold"}, "wanted a view among view_01"),
+        ({"region": {"cluster": 1, "of": 99}, "preset": "gold"}, "1 to 16 clusters"),
+    ],
+)
+def test_wrong_edits_are_refused(edit: dict[str, Any], said: str) -> None:
+    with pytest.raises(CaptureError, match=said):
+        after(edit)
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"edits": 3}', '{"edits": [{"colour": 1}]}'])
+def test_wrong_files_are_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "e.json").write_text(text)
+    with pytest.raises(CaptureError, match=r"e.json: wanted"):
+        read_edits(tmp_path / "e.json")

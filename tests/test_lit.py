@@ -1,0 +1,93 @@
+"""mvps.checks.lit: light against darkness, on pictures whose edges are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from mvps.checks.lit import Lit, lit_part, missing_parts, moved, steps, stray_parts, threshold
+from mvps.scene import Bool, Camera, View
+
+SIZE = 80
+CAMERA = Camera(np.array([[500.0, 0, SIZE / 2], [0, 500.0, SIZE / 2], [0, 0, 1]]), np.eye(3), np.array([0, 0, 10.0]), SIZE, SIZE)
+ROWS, COLUMNS = np.indices((SIZE, SIZE)) + 0.5
+
+
+def disc(radius: float, row: float = 40, column: float = 40) -> Bool:
+    return np.hypot(ROWS - row, COLUMNS - column) < radius
+
+
+def photographed(mask: Bool, radius: float = 25.0, hole: float = 0.0) -> View:
+    """A ball of this radius, darker towards its rim, whose rim pixels are covered in part, with a hole through it, on noise."""
+    distance = np.hypot(ROWS - 40, COLUMNS - 40)
+    coverage = np.clip(radius - distance + 0.5, 0, 1) * np.clip(distance - hole + 0.5, 0, 1)
+    shade = np.sqrt(np.clip(1 - (distance / (radius + 1)) ** 2, 0.05, 1))
+    noise = np.random.default_rng(0).uniform(0, 8, mask.shape)
+    frame = (10000 * coverage * shade + noise).astype(np.float32)
+    return View("ball", CAMERA, mask, np.zeros((int(mask.sum()), 0, 3), np.uint16), 1 / 65535, 65535, (), frame)
+
+
+def seen(view: View) -> Lit:
+    found = lit_part(view, steps(view.mask))
+    assert found is not None
+    return found
+
+
+def test_steps_are_distances_to_the_staircase() -> None:
+    mask = np.zeros((5, 6), bool)
+    mask[:, 2:4] = True
+    np.testing.assert_array_equal(steps(mask)[0], [1.5, 0.5, -0.5, -0.5, 0.5, 1.5])
+
+
+@pytest.mark.parametrize("dark", [0.0, 4.0])
+def test_the_threshold_lies_between_noise_and_object(dark: float) -> None:
+    frame = np.full((50, 50), dark, np.float32)
+    frame[10:30, 10:30] = np.geomspace(300, 30000, 400).reshape(20, 20)
+    assert dark < threshold(frame, 65535) < 300
+
+
+@pytest.mark.parametrize("pixels", [-6, -3, -1, 0, 1, 3, 6])
+def test_a_mask_is_moved_to_where_the_object_ends(pixels: int) -> None:
+    view = photographed(disc(25 + pixels))
+    found = seen(view)
+    assert found.judged and found.off == (pixels != 0)
+    assert abs(found.edge + pixels) < 0.75
+    if pixels:
+        left = (moved(view, steps(view.mask), found) ^ disc(25)).sum()
+        assert left < 0.15 * (view.mask ^ disc(25)).sum() + 12
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0])
+def test_a_blurred_edge_is_no_shrunk_mask(sigma: float) -> None:
+    view = photographed(disc(25))
+    blurred = gaussian_filter(view.frame, sigma)
+    soft = View("ball", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), blurred)
+    assert seen(soft).judged and not seen(soft).off
+
+
+def test_one_dark_side_does_not_make_a_mask_too_large() -> None:
+    view = photographed(disc(25))
+    assert view.frame is not None
+    frame = np.where((COLUMNS < 28) | (view.frame < 10), view.frame % 8, view.frame)
+    shadowed = View("ball", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), frame.astype(np.float32))
+    assert not seen(shadowed).off
+
+
+def test_a_bright_background_judges_nothing() -> None:
+    view = photographed(disc(25))
+    bright = View("ball", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), (30000 - view.frame).astype(np.float32))
+    assert not seen(bright).judged and not seen(bright).off
+
+
+def test_holes_are_missing_where_lit_and_honest_where_dark() -> None:
+    ring = disc(25) & ~disc(8)
+    assert len(missing_parts(ring, seen(photographed(ring)))) == 1
+    assert not missing_parts(ring, seen(photographed(ring, hole=8)))
+
+
+def test_dark_parts_at_the_rim_are_stray_and_those_inside_are_not() -> None:
+    blob = disc(25) | disc(5, 10, 12)
+    parts = stray_parts(blob, seen(photographed(blob)))
+    assert len(parts) == 1 and (parts[0] == disc(5, 10, 12)).all()
+    assert not stray_parts(disc(25), seen(photographed(disc(25), hole=6)))

@@ -1,0 +1,102 @@
+"""mvps.viewer and mvps.view: the data that the page holds is the model, and the server answers what the page asks."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import threading
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from sphere_scene import SphereScene, make_sphere
+
+import mvps.viewer
+from mvps.command import run
+from mvps.export import write_reconstruction
+from mvps.view import Model, main, server
+from mvps.viewer import packed, viewer_html
+
+UP, FROM = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    return make_sphere(3, coloured_lobes=True, tint=(1.0, 0.8, 0.4))
+
+
+def test_the_page_holds_the_model(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    html = viewer_html(r.surface, r.material, UP, FROM)
+    about = json.loads(re.search(r'id="viewer-about">(.*?)</script>', html)[1])  # type: ignore[index]
+    data = zlib.decompress(base64.b64decode(re.search(r'id="viewer-data">(.*?)</script>', html)[1]))  # type: ignore[index]
+    V, F = about["vertices"], about["faces"]
+    assert (len(r.surface.vertices), len(r.surface.faces)) == (V, F) and len(data) == 21 * V + 12 * F
+    parts = np.split(np.frombuffer(data, np.uint8), np.cumsum([6 * V, 6 * V, 3 * V, 4 * V, 2 * V]))
+    low, high = np.array(about["low"]), np.array(about["high"])
+    position = low + parts[0].view("<u2").reshape(V, 3) / 65535 * (high - low)
+    np.testing.assert_allclose(position, r.surface.vertices, atol=1e-3)
+    np.testing.assert_allclose(parts[1].view("<i2").reshape(V, 3) / 32767, r.material.normal, atol=1e-4)
+    np.testing.assert_allclose((parts[2].reshape(V, 3) / 255) ** 2 * about["white"], r.material.albedo, atol=0.01)
+    weight = (parts[3].reshape(V, 4) / 255) ** 2 * about["lobe_white"]
+    coloured = weight[:, :2, None] * np.array(about["tint"])[:2]
+    np.testing.assert_allclose(coloured, r.material.specular_weight, atol=0.005)
+    assert about["sharpness"][:2] == [12, 60] and not weight[:, 2:].any()
+    np.testing.assert_array_equal(parts[5].view("<u4").reshape(F, 3), r.surface.faces)
+
+
+def test_only_the_strongest_lobes_of_an_edited_material(scene: SphereScene) -> None:
+    material = scene.reconstruction.material
+    many = np.concatenate([material.specular_weight] * 3, axis=1) * np.array([1, 2, 3, 0.1, 5, 0.2])[:, None]
+    about, _ = packed(scene.reconstruction.surface, replace(material, specular_weight=many, sharpness=np.arange(1.0, 7)))
+    assert about["sharpness"] == [1, 2, 3, 5]
+
+
+def test_a_model_that_is_too_large_is_named(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mvps.viewer, "LARGEST_BYTES", 1000)
+    html = viewer_html(scene.reconstruction.surface, scene.reconstruction.material, UP, FROM)
+    assert "too large" in html and "<script" not in html
+
+
+@pytest.fixture(scope="module")
+def address(scene: SphereScene) -> Iterator[str]:
+    with server(Model(scene.reconstruction, scene.capture), 0) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{serving.server_port}"
+        serving.shutdown()
+
+
+def test_the_server_shows_the_page_and_photographs(address: str) -> None:
+    page = urlopen(f"{address}/").read().decode()
+    assert '"served": true' in page and "view_02, light 3" in page
+    assert urlopen(f"{address}/photograph?of=view_02/3").read()[:2] == b"\xff\xd8"
+
+
+def test_the_server_traces_shadows(address: str, scene: SphereScene) -> None:
+    seen = np.frombuffer(urlopen(f"{address}/shadow?light=0,0,1").read(), np.uint8)
+    assert len(seen) == len(scene.reconstruction.surface.vertices) and set(seen.tolist()) <= {0, 255}
+    assert (seen[scene.reconstruction.surface.vertices[:, 2] > 5] == 255).all()
+
+
+@pytest.mark.parametrize(
+    ("path", "code"),
+    [("/shadow?light=0,0,0", 400), ("/shadow?light=x", 400), ("/shadow", 400), ("/photograph?of=view_77/1", 400), ("/../etc/passwd", 404)],
+)
+def test_other_questions_are_refused(address: str, path: str, code: int) -> None:
+    with pytest.raises(HTTPError) as refused:
+        urlopen(f"{address}{path}")
+    assert refused.value.code == code
+
+
+def test_a_taken_port_is_named(address: str, scene: SphereScene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_reconstruction(scene.reconstruction, tmp_path / "result")
+    port = address.rpartition(":")[2]
+    assert run(main, [str(tmp_path / "result"), "--port", port, "--no-browser"]) == 2
+    assert f"--port {port}: wanted a free one" in capsys.readouterr().err
+    assert run(main, [str(tmp_path / "nothing"), "--no-browser"]) == 2
