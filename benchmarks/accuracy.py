@@ -18,9 +18,11 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 HERE = Path(__file__).resolve().parent
 
@@ -103,13 +105,40 @@ def measure(name: str, captures: Path, preset: str, device: str, folder: Path, r
     }
 
 
+class Ran(NamedTuple):
+    """What came of a command: exit code (None where it was stopped), what it said on standard error, seconds, seconds of the processor
+    (all cores together), largest resident set."""
+
+    code: int | None
+    said: str
+    seconds: float
+    processor_seconds: float
+    peak_mb: float
+
+
+def ran(command: list[str], limit: float | None = None) -> Ran:
+    """Runs a command, stopped after `limit` seconds; the largest resident set is in 10^6 bytes (Linux counts it in units of 1024)."""
+    with tempfile.TemporaryFile("w+") as said:
+        start = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=said)
+        timer = threading.Timer(limit or 0, process.kill)
+        if limit is not None:
+            timer.start()
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - start
+        timer.cancel()
+        said.seek(0)
+        stopped = limit is not None and seconds >= limit
+        code, processor = None if stopped else os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime
+        return Ran(code, said.read(), seconds, processor, usage.ru_maxrss * 1024 / 1e6)
+
+
 def peak_mb(command: list[str]) -> float:
-    """Runs a command; its largest resident set, 10^6 bytes (Linux counts it in units of 1024)."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    if status:
-        raise SystemExit(f"{' '.join(command)}: exit code {os.waitstatus_to_exitcode(status)}")
-    return usage.ru_maxrss * 1024 / 1e6
+    """Runs a command that must not fail; its largest resident set, 10^6 bytes."""
+    found = ran(command)
+    if found.code:
+        raise SystemExit(f"{' '.join(command)}: exit code {found.code}. {found.said}")
+    return found.peak_mb
 
 
 def seconds_of(stages: list[dict[str, Any]]) -> dict[str, float]:
@@ -120,12 +149,12 @@ def seconds_of(stages: list[dict[str, Any]]) -> dict[str, float]:
     return total
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as Markdown."""
-    titles = ["case", *(title for title, *_ in COLUMNS), "status"]
+def table(rows: list[dict[str, Any]], columns: Sequence[tuple[str, str, float, int]] = COLUMNS) -> str:
+    """The rows as Markdown; columns: title, key, factor, decimal digits."""
+    titles = ["case", *(title for title, *_ in columns), "status"]
     lines = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
     for row in rows:
-        figures = [f"{factor * row[key]:.{digits}f}" if key in row else "-" for _, key, factor, digits in COLUMNS]
+        figures = [f"{factor * row[key]:.{digits}f}" if key in row else "-" for _, key, factor, digits in columns]
         lines.append("| " + " | ".join([row["case"], *figures, row["status"]]) + " |")
     return "\n".join(lines)
 

@@ -24,7 +24,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from mvps.mesh import edge_numbers, face_areas, face_normals, normalise
-from mvps.scene import Bool, Float, Int, Surface, checked
+from mvps.scene import Bool, Float, Int, Surface
+from mvps.values import checked
 
 AXES = normalise(
     np.array(

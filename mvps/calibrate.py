@@ -12,6 +12,9 @@ a hull's normals are exact near the silhouettes and far off in concavities.
 Where the lights stand still in the camera's frame (one rig), all pixels of all views are factorised together in camera frames.
 That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations.
 
+Metals have no diffuse body, and the factors say nothing: where highlights explain the images better than Lambert's law does, the lights
+are those by correlation (correlation.py).
+
 Views with fewer than MINIMUM_LIGHTS lights cannot be factorised; there the lights are the least-squares solution of I_pl = n_p . s_l
 for the rough shape's normals, one albedo for the whole object (other albedos are outliers).
 """
@@ -24,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.cores import on_cores
+from mvps.correlation import glossy_lights, is_glossy
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
@@ -57,12 +61,14 @@ class Calibration:
     """Lights of all views, and how well the factorisation explains the images.
 
     residual: relative RMS that three factors leave; fourth_singular_value: over the first one. Both are 0.05 to 0.15 on matte and glossy
-    objects and above 0.25 where there is no diffuse body (metals): there the lights are not to be trusted.
+    objects and above 0.25 where there is no diffuse body. metallic: the lights are those by correlation (correlation.py), and photometric
+    stereo by Lambert's law would say nothing.
     """
 
     lights: Lights
     residual: float
     fourth_singular_value: float
+    metallic: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,14 +81,25 @@ class _Sampled:
     normal: Float
     noise: float
 
+    @property
+    def absolute(self) -> Float:
+        """(n, lights) radiance."""
+        absolute: Float = self.image * self.bright[:, None]
+        return absolute
+
 
 def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> _Sampled:
     chosen = generator.permutation(len(view.pixels))[:PIXELS_PER_VIEW]
     hits = camera_hits(caster, view.camera, view.pixels[chosen])
     on = hits.face >= 0
+    if not on.any():
+        raise CaptureError(
+            f"{view.name}: wanted a camera that sees what all masks enclose, given one from which no pixel of its mask meets it;"
+            " check this view's rotation, translation and mask, or leave it out with --views"
+        )
     chosen, hits = chosen[on], Hits(hits.face[on], hits.barycentric[on], hits.distance[on])
     image = view.samples[chosen].astype(np.float64).mean(-1) * view.scale
-    bright = np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True)
+    bright = np.quantile(image if view.shown.all() else image[:, view.shown], BRIGHT_QUANTILE, axis=1, keepdims=True)
     bright = np.maximum(bright, view.scale)
     known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
     seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
@@ -145,21 +162,32 @@ def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
     # The median albedo is the unit, so that lights of separately solved views share one scale.
     albedo = np.linalg.norm(factors.left @ A.T, axis=1) * np.concatenate([s.bright for s in samples])
     scaled: Float = factors.right @ np.linalg.inv(A) * np.median(albedo)
-    return scaled
+    return _without_gaps(scaled)
+
+
+def _without_gaps(scaled: Float) -> Float:
+    """(lights, 3) in which lights that no sample speaks of stand at the camera, with the median intensity: something finite that nothing
+    weighs."""
+    length = np.linalg.norm(scaled, axis=1)
+    known = length > 1e-9 * length.max(initial=0)
+    if known.all() or not known.any():
+        return scaled
+    return np.where(known[:, None], scaled, np.array([0.0, 0.0, -1.0]) * np.median(length[known]))
 
 
 def _from_normals(sample: _Sampled) -> Float:
     """(lights, 3) least-squares lights for the rough shape's normals and one albedo: the case of few lights."""
     # A pixel's own bright level says nothing of its albedo where few lights made it: radiance itself is used.
-    absolute = sample.image * sample.bright[:, None]
+    absolute = sample.absolute
     unsaturated = sample.known | (sample.image <= SHADOWED)
+    unsaturated &= sample.known.any(0)
     lit = (unsaturated & (absolute > SHADOWED * np.quantile(absolute, BRIGHT_QUANTILE, axis=0))).astype(np.float64)
     lights = solve_rows(absolute.T, lit.T, sample.normal)
     for _ in range(AMBIGUITY_SWEEPS):
         residual = absolute - sample.normal @ lights.T
         weights = robust_weights(residual.T, lit.T, sample.noise * float(np.median(sample.bright)))
         lights = solve_rows(absolute.T, weights, sample.normal)
-    return lights
+    return _without_gaps(lights)
 
 
 def colour_ratios(view: View) -> Float:
@@ -167,7 +195,9 @@ def colour_ratios(view: View) -> Float:
     albedo is taken as the mean over all lights, so only differences between lights count."""
     total = np.maximum(view.samples.sum(0, dtype=np.float64), 1.0)
     chroma = total / total.mean(1, keepdims=True)
-    ratio = chroma / np.median(chroma, axis=0)
+    usual = np.median(chroma[view.shown], axis=0) if view.shown.any() else np.ones(3)
+    # A photograph that was left out says nothing: white.
+    ratio = np.where(view.shown[:, None], chroma / usual, 1.0)
     of_mean_one: Float = ratio / ratio.mean(1, keepdims=True)
     return of_mean_one
 
@@ -204,11 +234,24 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
             floor=float(np.median([s.noise for s in samples])),
         )
         if together.residual**2 < POOLED_VARIANCE_RATIO * residual**2:
-            rig = _scaled_lights(together, samples)
+            image, seen = (np.concatenate(parts) for parts in zip(*((s.absolute, s.normal) for s in samples), strict=True))
+            metallic = is_glossy([image], [seen], generator)
+            rig = glossy_lights(image, seen) if metallic else _scaled_lights(together, samples)
             lights = _assemble(capture, [rig] * len(samples), True)
-            return Calibration(lights, together.residual, float(together.singular_values[3]))
+            return Calibration(lights, together.residual, float(together.singular_values[3]), metallic)
+    if is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator):
+        scaled = [glossy_lights(s.absolute, s.normal) for s in samples]
+        return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
     scaled = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
     return Calibration(_assemble(capture, scaled, False), residual, fourth)
+
+
+def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
+    """Whether highlights explain the photographs better than Lambert's law does, every view for itself, under a rough surface's normals."""
+    generator = np.random.default_rng(seed)
+    caster, normal = ray_caster(surface), vertex_normals(surface)
+    samples = [_sampled(view, caster, normal, generator) for view in capture.views]
+    return is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator)
 
 
 def _assemble(capture: Capture, scaled: list[Float], one_rig: bool) -> Lights:

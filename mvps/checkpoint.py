@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
+from mvps.inputs import DAMAGED, JSON_LIMIT, check_npz, read_file
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError, Lights
 
@@ -91,7 +91,7 @@ class Checkpoints:
             return
         if not resume or not (folder / RUN).exists():
             shutil.rmtree(folder)
-        elif (folder / RUN).read_text(encoding="utf-8") != self._run:
+        elif read_file(folder / RUN, JSON_LIMIT) != self._run.encode():
             raise CaptureError(
                 f"{folder}: wanted the checkpoints of a run with these options on this capture, given those of another; see {RUN}"
                 " there, or start anew without --resume"
@@ -111,10 +111,11 @@ class Checkpoints:
 
     def _read(self, path: Path) -> Any:
         try:
+            check_npz(path)
             with np.load(path, allow_pickle=False) as arrays:
                 text = json.loads(bytes(arrays["text"]))
                 return unpacked(text, {name: arrays[name] for name in arrays.files}, self._kinds, self._device)
-        except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+        except DAMAGED as error:
             raise CaptureError(f"{path}: wanted a whole checkpoint, given a damaged one ({error}); start anew without --resume") from error
 
     def _write(self, path: Path, value: Any) -> None:
@@ -128,6 +129,9 @@ class Checkpoints:
 def _replaced(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """The file with what `write` writes, whole or as it was."""
     beside = path.with_name(f".{path.name}")
-    with beside.open("wb") as file:
-        write(file)
-    os.replace(beside, path)
+    try:
+        with beside.open("wb") as file:
+            write(file)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)

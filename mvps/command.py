@@ -6,8 +6,9 @@ exit code   0 done,  2 bad input (one sentence on standard error),  130 interrup
 from __future__ import annotations
 
 import argparse
+import errno
 import gc
-import json
+import io
 import logging
 import math
 import os
@@ -16,9 +17,20 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from mvps.memory import keep_freed
-from mvps.progress import ConsoleHandler
-from mvps.scene import CaptureError
+from mvps.addresses import loading
+
+# These load numpy.
+with loading():
+    from mvps.inputs import parsed_json
+    from mvps.memory import keep_freed
+    from mvps.progress import ConsoleHandler
+    from mvps.scene import CaptureError
+
+NO_MEMORY = ("allocate memory", "out of memory", "start new thread", "insufficient memory", "bad_alloc", "failed to map segment")
+"""In what libraries say when they find none, small letters: torch's allocators, Python's threads, OpenCV, C++, the loader."""
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+"""Faults of writing to an open file, which name none."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -54,6 +66,9 @@ def parse(made: Parser, argv: Sequence[str]) -> argparse.Namespace:
 def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:
     """Run a command with these arguments (None: those of the process) and return its exit code."""
     keep_freed()
+    # A path need not be text: what has no letter is shown by its number.
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         main(sys.argv[1:] if argv is None else argv)
         sys.stdout.flush()
@@ -68,10 +83,11 @@ def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None
         # What is still buffered would raise once more when the interpreter closes standard output.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except OSError as error:
-        if error.filename is None:
+    except Exception as error:
+        sentence = _of_the_machine(error)
+        if not sentence:
             raise
-        return _complain(f"{error.filename}: {error.strerror}; check the path, its permissions and the free space")
+        return _complain(sentence)
     except KeyboardInterrupt:
         print("mvps: interrupted before the end", file=sys.stderr)
         return 130
@@ -81,8 +97,26 @@ def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None
     return 0
 
 
+def _of_the_machine(error: Exception) -> str:
+    """A sentence where not the program failed but the machine refused: memory, threads, a file; else empty."""
+    if isinstance(error, MemoryError) or any(words in str(error).lower() for words in NO_MEMORY):
+        said = str(error).strip().splitlines()[:1] or ["none was left"]
+        return (
+            f"memory: wanted more than there is ({said[0][:120]}); use fewer --views or --lights, a quicker --preset or --max-memory,"
+            " or raise the limit (ulimit -v)"
+        )
+    if isinstance(error, OSError) and error.filename is not None:
+        name = error.filename if isinstance(error.filename, str) else os.fsdecode(error.filename)
+        return f"{name}: {error.strerror}; check the path, its permissions and the free space"
+    if isinstance(error, OSError) and error.errno in NO_ROOM:
+        return f"writing a file: {error.strerror}; make room, or give another --out"
+    return ""
+
+
 def _complain(message: str) -> int:
-    print(f"mvps: {' '.join(message.split())}", file=sys.stderr)
+    # Names of files come from whoever made them: what would move a terminal's cursor is shown by its number.
+    words = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in " ".join(message.split()))
+    print(f"mvps: {words}", file=sys.stderr)
     return 2
 
 
@@ -110,7 +144,7 @@ def lights_argument(text: str) -> tuple[int, ...] | Mapping[str, tuple[int, ...]
     if not text.strip() or set(text) <= set("0123456789, -+"):
         return number_list(text)
     try:
-        lights = json.loads(Path(text).read_bytes())
+        lights = parsed_json(Path(text).read_bytes())
     except OSError as error:
         raise argparse.ArgumentTypeError(f"{text}: wanted a JSON file, or numbers such as 1,5,9, given {error.strerror}") from None
     except ValueError as error:

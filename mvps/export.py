@@ -21,17 +21,18 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from mvps.cores import at_a_time, on_cores
 from mvps.folders import appearing_whole
 from mvps.gltf import glb_bytes, metallic_roughness
+from mvps.inputs import DAMAGED, JSON_LIMIT, check_npy, check_npz, parsed_json, read_file
 from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
@@ -83,10 +84,12 @@ def read_reconstruction(folder: Path) -> Reconstruction:
             f"{folder}: wanted a result folder, given one without {', '.join(missing)}; give the folder that mvps.reconstruct --out wrote"
         )
     mesh = read_ply(folder / "mesh.ply")
-    record = _read_json(folder / "lights.json")
-    views = tuple(record["views"])
+    record, metrics, settings = (_read_json(folder / f"{name}.json") for name in ("lights", "metrics", "settings"))
     try:
-        with np.load(folder / "material.npz") as arrays:
+        views = tuple(_view_name(view) for view in record["views"])
+        check_account(metrics, settings)
+        check_npz(folder / "material.npz")
+        with np.load(folder / "material.npz", allow_pickle=False) as arrays:
             values = {name: arrays[name] for name in _MATERIAL} | {name: kind(arrays[name]) for name, kind in _OF_ALL.items()}
             material = Material(normal=mesh.normals, **values, residual=_residual(arrays))
         return Reconstruction(
@@ -98,13 +101,51 @@ def read_reconstruction(folder: Path) -> Reconstruction:
                 one_rig=bool(record["one_rig"]),
             ),
             views=views,
-            light_names=tuple(tuple(record["views"][view]["lights"]) for view in views),
-            normal_maps=tuple(np.load(folder / "normals" / f"{view}.npy") for view in views),
-            metrics=_read_json(folder / "metrics.json"),
-            settings=_read_json(folder / "settings.json"),
+            light_names=tuple(_light_numbers(record["views"][view]["lights"]) for view in views),
+            normal_maps=tuple(_normal_map(folder / "normals" / f"{view}.npy") for view in views),
+            metrics=metrics,
+            settings=settings,
         )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
+    except DAMAGED as error:
         raise CaptureError(f"{folder}: wanted a whole result, given a damaged one ({error}); run mvps.reconstruct again") from error
+
+
+def _view_name(name: str) -> str:
+    if not re.fullmatch(r"\w+", name):
+        raise ValueError(f"lights.json: wanted names of views such as view_01, given {name[:40]!r}")
+    return name
+
+
+def _light_numbers(numbers: Any) -> tuple[int, ...]:
+    if not isinstance(numbers, list) or not all(type(n) is int and 1 <= n < 1 << 31 for n in numbers) or len(set(numbers)) != len(numbers):
+        raise ValueError(f"lights.json: wanted distinct numbers from 1 as lights, given {str(numbers)[:40]}")
+    return tuple(numbers)
+
+
+def _normal_map(path: Path) -> Any:
+    """(height, width, 3) float32."""
+    check_npy(path)
+    normals = np.load(path, allow_pickle=False)
+    if normals.ndim != 3 or normals.shape[2] != 3 or normals.dtype != np.float32:
+        raise ValueError(f"{path.name}: wanted float32 of shape (height, width, 3), given {normals.dtype} of shape {normals.shape}")
+    return normals
+
+
+def check_account(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
+    """ValueError where metrics or settings hold other kinds of values than the commands that read them take."""
+    model = metrics.get("model") or {}
+    records = [metrics.get("stages") or [], metrics.get("rounds") or [], model.get("components") or []]
+    texts = [metrics.get("status") or {}, model]
+    truth = metrics.get("truth") or {}
+    if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in records) or not all(
+        isinstance(value, dict) for value in texts
+    ):
+        raise ValueError("metrics.json: wanted stages, rounds and components as lists of objects, given other values")
+    if not isinstance(truth, dict) or not all(isinstance(value, int | float) and abs(value) < 1e300 for value in truth.values()):
+        raise ValueError("metrics.json: wanted numbers as truth, given other values")
+    held = [settings.get(name) or [] for name in ("hold_out_views", "hold_out_lights")]
+    if not all(isinstance(numbers, list) and all(type(n) is int for n in numbers) for numbers in held):
+        raise ValueError("settings.json: wanted lists of numbers as hold_out_views and hold_out_lights, given other values")
 
 
 _MATERIAL = ("albedo", "specular_weight", "sharpness", "confidence")
@@ -162,8 +203,8 @@ def _json(name: str, value: Any, sort: bool = True) -> bytes:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        value = parsed_json(read_file(path, JSON_LIMIT))
+    except (OSError, ValueError) as error:
         raise CaptureError(f"{path}: wanted JSON, given something else ({error}); run mvps.reconstruct again") from error
     if not isinstance(value, dict) or (path.name == "lights.json" and not isinstance(value.get("views"), dict)):
         raise CaptureError(f"{path}: wanted a JSON object as mvps.reconstruct writes it, given another; run mvps.reconstruct again")

@@ -42,8 +42,13 @@ def appearing_whole(folder: Path, marks: tuple[str, ...] = (), unfinished: str =
 
 
 def check_place(place: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> None:
-    """CaptureError unless the place is free, an empty folder, or one that may be replaced: with all the files named in `marks`, by which an
-    earlier output of the same kind is known, or with nothing but what is called `unfinished`, the rest of an interrupted one."""
+    """CaptureError unless the place can be written and is free, an empty folder, or one that may be replaced: with all the files named in
+    `marks`, by which an earlier output of the same kind is known, or with nothing but what is called `unfinished`, the rest of an
+    interrupted one."""
+    above = next(folder for folder in place.parents if folder.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        given = "one that cannot be written" if above.is_dir() else f"{above.name}, a file"
+        raise CaptureError(f"{place}: wanted a place in a folder that can be written, given {given}; give another --out")
     if not place.exists():
         return
     if not place.is_dir():

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.optimize import linprog
 from skimage.measure import marching_cubes
 
-from mvps.camera import inside_image, pixel_footprint, project
+from mvps.camera import pixel_footprint, project
 from mvps.cores import on_cores
-from mvps.mesh import largest_component, lengths
+from mvps.mesh import largest_component
 from mvps.scene import Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
-from mvps.silhouette import mask_distances, sampled
+from mvps.silhouette import beyond_mask, mask_distances
 
 MARGIN_CELLS = 3
 """Cells of free space kept around the hull, so that the level set closes inside the grid."""
@@ -65,19 +65,19 @@ def bounds(capture: Capture) -> tuple[Float, Float]:
                     f" silhouettes {why}; check Calib_Results.mat and the masks, or use views from more sides"
                 )
             corners[side, axis] = solution.x[axis]
-    return corners[0] * unit + origin, corners[1] * unit + origin
+    low, high = corners * unit + origin
+    if not (high > low).all():
+        raise CaptureError(
+            f"{capture.name}: wanted cameras around an object, given {len(capture.views)} views whose silhouettes enclose a box without"
+            " volume; check the translations in Calib_Results.mat"
+        )
+    return low, high
 
 
 def _distance(view: View, field: NDArray[np.float32], points: Float) -> NDArray[np.float32]:
     """Signed distance of world points (n, 3) to one view's silhouette cone, world units, -inf where the view cannot tell."""
     image, depth = project(view.camera, points)
-    pixels = sampled(field, image)
-    # Beyond the image nothing was photographed: such points are outside, at least by their distance to the image.
-    outside = np.flatnonzero(~inside_image(view.camera, image))
-    limit = np.array([view.camera.width, view.camera.height])
-    beyond = lengths(np.maximum(np.maximum(-image[outside], image[outside] - limit), 0))
-    pixels[outside] = np.maximum(pixels[outside], 0.5) + beyond
-    return np.where(depth > 0, pixels * depth / view.camera.focal_length, np.inf).astype(np.float32)
+    return np.where(depth > 0, beyond_mask(view.camera, field, image) * depth / view.camera.focal_length, np.inf).astype(np.float32)
 
 
 class _Masks:

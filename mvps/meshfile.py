@@ -9,16 +9,22 @@ OBJ  text, nine significant digits (enough for float32); v, vt, vn lines, then f
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.inputs import file_size, read_file
 from mvps.scene import CaptureError, Float, Int
 
 _VERTEX = np.dtype([(n, "<f8") for n in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")])
 _FACE = np.dtype([("count", "u1"), ("indices", "<i4", (3,))])
+
+
+HEADER_LIMIT = 4096
+"""Bytes that hold any header written here: 14 lines."""
 
 
 class PlyMesh(NamedTuple):
@@ -53,22 +59,24 @@ def ply_bytes(mesh: PlyMesh, comment: str) -> bytes:
 
 def read_ply(path: Path) -> PlyMesh:
     """A mesh written by `ply_bytes`. CaptureError where the file is another program's PLY or cut short."""
-    data = path.read_bytes()
-    end = data.find(b"end_header\n")
-    lines = data[:end].decode("ascii", "replace").splitlines() if end >= 0 else []
-    counts = {words[1]: int(words[2]) for words in map(str.split, lines) if words[:1] == ["element"] and words[-1].isdigit()}
-    comment = next((line[len("comment ") :] for line in lines if line.startswith("comment ")), "")
+    size = file_size(path)
+    head = read_file(path, size, HEADER_LIMIT)
+    end = head.find(b"end_header\n")
+    lines = head[:end].decode("ascii", "replace").split("\n")[:-1] if end >= 0 else []
+    counts = {m[1]: int(m[2]) for m in (re.fullmatch(r"element (vertex|face) (\d{1,12})", line) for line in lines) if m}
+    comment = next((line[len("comment ") :] for line in lines if line.startswith("comment ") and line.isascii()), "")
     vertices, faces = counts.get("vertex", 0), counts.get("face", 0)
-    if not lines or data[: end + 11] != _header(vertices, faces, comment):
+    if not lines or head[: end + 11] != _header(vertices, faces, comment):
         raise CaptureError(
             f"{path}: wanted a PLY file with the properties that mvps writes, given another kind of file;"
             " restore the file or run mvps.reconstruct again"
         )
-    body, wanted = data[end + 11 :], vertices * _VERTEX.itemsize + faces * _FACE.itemsize
-    if len(body) != wanted:
+    given, wanted = size - end - 11, vertices * _VERTEX.itemsize + faces * _FACE.itemsize
+    if given != wanted:
         raise CaptureError(
-            f"{path}: wanted {wanted} bytes after the header, given {len(body)}; the file is damaged, run mvps.reconstruct again"
+            f"{path}: wanted {wanted} bytes after the header, given {given}; the file is damaged, run mvps.reconstruct again"
         )
+    body = memoryview(read_file(path, size))[end + 11 :]
     vertex = np.frombuffer(body, _VERTEX, vertices)
     face = np.frombuffer(body, _FACE, faces, offset=vertices * _VERTEX.itemsize)
     positions, normals, colours = (

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mvps.command import lights_argument, number_list, parse, parser, run
+from mvps.inputs import shown
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, parted
 from mvps.scene import Capture, Lights, Reconstruction
@@ -113,7 +114,7 @@ def _whole(made: Reconstruction, capture: Capture, settings: Settings) -> Recons
 
     from mvps.device import chosen_device
     from mvps.measures import mesh_normals
-    from mvps.reconstruct import all_lights, versions
+    from mvps.outcome import all_lights, versions
     from mvps.visibility import ray_caster
 
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
@@ -160,14 +161,16 @@ def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
     """Read the capture, run the method and write its result folder. CaptureError where the method cannot run on it."""
     from mvps.export import write_reconstruction
     from mvps.load import read_calibrated_lights, read_capture
+    from mvps.sound import sound
 
     method, progress = METHODS[name], Progress()
     with progress.stage("load"):
         capture = read_capture(path, settings.views or None, settings.lights or None)
+    capture, findings = sound(capture, progress)
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     lights = read_calibrated_lights(path, used) if method.calibrated else None
     made = method.run(capture, replace(settings, calibrated_lights=method.calibrated), lights, progress)
-    metrics = {**made.metrics, "stages": progress.stages}
+    metrics = {**made.metrics, "stages": progress.stages, "findings": [asdict(one) for one in findings]}
     write_reconstruction(replace(made, metrics=metrics, settings={**made.settings, "method": name}), out)
 
 
@@ -196,7 +199,7 @@ def main(argv: Sequence[str]) -> None:
         made.add_argument(f"--{name}", type=kind, default=default, help=words)
     given = parse(made, argv)
     chosen = {name.replace("-", "_"): getattr(given, name.replace("-", "_")) for name in OPTIONS}
-    run_method(given.capture, given.method, Settings(str(given.capture), **chosen), given.out)
+    run_method(given.capture, given.method, Settings(shown(given.capture), **chosen), given.out)
 
 
 if __name__ == "__main__":

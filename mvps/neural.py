@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvps.scene import Float, Residual
-from mvps.shading import half_dot_normal
+from mvps.shading import against, half_dot_normal
 
 LARGEST = 4.0
 """Of the factor's logarithm, and of what the moments say: a photograph of 16 bits holds no larger range under one light."""
@@ -44,14 +44,14 @@ def moments(normal: Tensor, view: Tensor, light: Tensor) -> Tensor:
 
 def inputs(normal: Tensor, view: Tensor, light: Tensor, code: Tensor) -> Tensor:
     """(n, lights, 9 + descriptors) the network's x for codes (n, MOMENTS + descriptors); the rest as in `moments`."""
-    n_dot_l, v_dot_l = (normal @ light.T).clamp_min(0), view @ light.T
+    n_dot_l, v_dot_l = against(normal, light).clamp_min(0), against(view, light)
     n_dot_v = (normal * view).sum(-1, keepdim=True).clamp_min(0)
     half = half_dot_normal(n_dot_v, n_dot_l, v_dot_l).clamp(-1, 1)
     away = 1 - half
     terms = moments(normal, view, light) * code[:, None, :MOMENTS]
     said = [terms[..., part].sum(-1).clamp(-LARGEST, LARGEST) for part in (slice(0, 1), slice(1, 4), slice(4, MOMENTS))]
     angles = [n_dot_l * n_dot_v, n_dot_l + n_dot_v, half, away.sqrt(), torch.log(away + 1e-3), v_dot_l]
-    descriptors = code[:, None, MOMENTS:].expand(-1, len(light), -1)
+    descriptors = code[:, None, MOMENTS:].expand(-1, light.shape[-2], -1)
     return torch.cat([torch.stack(angles + said, -1), descriptors], -1)
 
 
@@ -65,10 +65,11 @@ def log_factor(x: Tensor, layers: Layers) -> Tensor:
 
 def factor(residual: Residual, share: Float, code: Float, normal: Float, view: Float, light: Float) -> NDArray[np.float32]:
     """(n, lights) by which the radiance of points is multiplied; share (n,) is m, code as interpolated; the rest as in `moments`."""
-    out = np.ones((len(share), len(light)), np.float32)
+    out = np.ones((len(share), light.shape[-2]), np.float32)
     some = np.flatnonzero(share > 0)
     layers = [(torch.tensor(w), torch.tensor(b)) for w, b in residual.layers]
     n, v, c = (torch.tensor(a[some], dtype=torch.float32) for a in (normal, view, code))
-    g = log_factor(inputs(n, v, torch.tensor(light, dtype=torch.float32), c), layers).numpy()
+    towards = torch.tensor(light if light.ndim == 2 else light[some], dtype=torch.float32)
+    g = log_factor(inputs(n, v, towards, c), layers).numpy()
     out[some] = np.exp(share[some, None].astype(np.float32) * g)
     return out

@@ -125,8 +125,9 @@ class _Training(Training):
 
 
 def averaged(view: View, intensity: Float) -> NDArray[np.float32]:
-    """(pixels, 3) mean over the lights of radiance over intensity (lights, 3), of a view's foreground pixels."""
-    factor = (view.scale / (len(intensity) * intensity)).astype(np.float32)
+    """(pixels, 3) mean over the lights of radiance over intensity (lights, 3), of a view's foreground pixels; without photographs that
+    were left out."""
+    factor = (view.scale * view.shown[:, None] / (max(1, int(view.shown.sum())) * intensity)).astype(np.float32)
     mean: NDArray[np.float32] = np.einsum("plc,lc->pc", view.samples, factor)
     return mean
 

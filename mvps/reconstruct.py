@@ -12,19 +12,20 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mvps import __version__
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
+from mvps.finding import Finding
+from mvps.inputs import shown
 from mvps.memory import keep_below
+from mvps.outcome import all_lights, normal_pictures, told, versions
 from mvps.progress import Progress, peak_memory_mb
 from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
 if TYPE_CHECKING:
     from mvps.checkpoint import Checkpoints
-    from mvps.device import Device
     from mvps.joint.refine import Refined, RefineSettings
     from mvps.occupancy import Occupancy, OccupancySettings
     from mvps.plan import Parts
-    from mvps.scene import Material, SignedDistanceGrid, Surface
+    from mvps.scene import SignedDistanceGrid, Surface
 
 PRESETS = ("draft", "standard", "fine")
 
@@ -122,7 +123,7 @@ def shaped(
     """
     from mvps.device import chosen_device
     from mvps.joint.pixels import OWN_LIGHTS
-    from mvps.joint.refine import POOR_FIT
+    from mvps.material import POOR_FIT
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
 
     rounds, shift = list(rough.rounds), rough.rounds[0]["vertex_change_px"]
@@ -174,74 +175,6 @@ def stage_two(
     return refined
 
 
-def all_lights(
-    capture: Capture, used: Capture, held: Capture | None, lights: Lights, surface: Surface, material: Material, device: Device
-) -> Lights:
-    """Lights of every photograph of `capture`, in its order: `lights` where used, else carried over from the rig or fitted."""
-    import numpy as np
-
-    from mvps.joint.held_out import carried_over, fit_lights
-
-    known: dict[tuple[str, int], tuple[Any, Any]] = {}
-    for view, directions, intensities in zip(used.views, lights.direction, lights.intensity, strict=True):
-        known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
-    if held is not None and lights.one_rig:
-        rotations = [view.camera.rotation for view in used.views]
-        for view in held.views:
-            directions, intensities = carried_over(lights, rotations, view.camera.rotation)
-            rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
-            known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
-    if held is not None:
-        unknown = {view.name: [n for n in view.lights if (view.name, n) not in known] for view in held.views}
-        rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
-        if rest is not None:
-            shared = lights.one_rig and len({view.lights for view in rest.views}) == 1
-            fitted = fit_lights(rest, surface, material, shared, device)
-            for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
-                known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
-    direction = tuple(np.array([known[view.name, n][0] for n in view.lights]) for view in capture.views)
-    intensity = tuple(np.array([known[view.name, n][1] for n in view.lights]) for view in capture.views)
-    return Lights(direction, intensity, lights.one_rig)
-
-
-def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[Any, ...]:
-    """Refined normals (height, width, 3) of every view, NaN outside the mask.
-
-    Views that were used show their own pixels' normals, as far as they were solved (`filled`); held-out ones the vertices' normals. A pixel
-    that misses the mesh takes its nearest neighbour's.
-    """
-    import numpy as np
-    from scipy.ndimage import distance_transform_edt
-
-    from mvps.joint.pixels import filled
-    from mvps.rendering import points_under
-    from mvps.visibility import ray_caster
-
-    caster = ray_caster(refined.surface)
-    own = {view.name: maps for view, maps in zip(used.views, refined.maps, strict=True)}
-    pictures = []
-    for view in capture.views:
-        points = points_under(caster, refined.material, view.camera, view.pixels)
-        normal = filled(view, own[view.name], points.normal) if view.name in own else points.normal
-        picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
-        picture[view.mask] = np.where(points.hit[:, None], normal, np.nan)
-        if points.hit.any():
-            nearest = distance_transform_edt(np.isnan(picture[..., 0]), return_distances=False, return_indices=True)
-            picture = picture[tuple(nearest)]
-        picture[~view.mask] = np.nan
-        pictures.append(picture)
-    return tuple(pictures)
-
-
-def versions() -> dict[str, str]:
-    """Versions of the program and of the libraries that its figures depend on."""
-    import platform
-    from importlib.metadata import version
-
-    names = ("torch", "numpy", "scipy", "libigl", "embreex", "scikit-image", "gpytoolbox", "opencv-python-headless")
-    return {"mvps": __version__, "python": platform.python_version(), **{name: version(name) for name in names}}
-
-
 class Begun(NamedTuple):
     """What Stage II starts with."""
 
@@ -257,18 +190,23 @@ def reconstruct(
     progress: Progress,
     parts: Parts | None = None,
     checkpoints: Checkpoints | None = None,
+    findings: Sequence[Finding] = (),
 ) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
-    checkpoints: of long stages, kept and gone on from; none if None."""
+    checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
     from mvps.device import chosen_device
-    from mvps.joint.refine import POOR_FIT
     from mvps.joint.thinned import thinned
+    from mvps.material import POOR_FIT
     from mvps.photometric import normal_maps
     from mvps.plan import Parts, between_passes, first_pass, last_pass
 
     parts = parts or Parts()
     device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    if len(used.views) == 1:
+        from mvps.oneview import reconstruct_view
+
+        return reconstruct_view(capture, used, held, settings, lights, parts, progress, findings)
     grid, surface = rough_shape(used, progress)
     start = first_lights(used, surface, lights, settings.seed, progress, parts.one_rig)
     with progress.stage("photometric stereo"):
@@ -295,24 +233,7 @@ def reconstruct(
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
         pictures = normal_pictures(capture, used, refined)
-    metrics = {"stages": progress.stages, "rounds": rounds + refined.rounds, "status": {"name": refined.status, "text": refined.text}}
-    metrics["model"] = {
-        "components": [asdict(trial) for trial in refined.trials],
-        "sharpness": list(refined.law.sharpness),
-        "grazing": refined.law.grazing,
-        "bounce": refined.law.bounce,
-        "share_with_neural_residual": 0.0 if refined.material.residual is None else float(refined.material.residual.share.mean()),
-    }
-    return Reconstruction(
-        refined.surface,
-        refined.material,
-        complete,
-        tuple(view.name for view in capture.views),
-        tuple(view.lights for view in capture.views),
-        pictures,
-        metrics,
-        {**asdict(settings), "versions": versions()},
-    )
+    return told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, findings)
 
 
 def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, out: Path, progress: Progress) -> None:
@@ -377,7 +298,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--resume", action="store_true", help="go on where an interrupted run with the same options stopped")
     given = parse(made, argv)
     settings = Settings(
-        str(given.capture),
+        shown(given.capture),
         given.preset,
         given.views,
         given.lights,
@@ -390,6 +311,7 @@ def main(argv: Sequence[str]) -> None:
     from mvps.export import CHECKPOINT, RESULT_MARKS
     from mvps.folders import check_place
     from mvps.load import read_calibrated_lights, read_capture
+    from mvps.sound import sound
 
     def before_decoding(sizes: list[tuple[int, int]]) -> None:
         if given.max_memory is not None:
@@ -404,11 +326,14 @@ def main(argv: Sequence[str]) -> None:
     with progress.stage("load") as stage:
         capture = read_capture(given.capture, given.views or None, given.lights or None, before_decoding)
         stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
+    capture, findings = sound(capture, progress)
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     lights = read_calibrated_lights(given.capture, used) if given.calibrated_lights else None
     kept = checkpoints_of(given.out, capture, settings, lights, given.resume)
-    reconstruction = reconstruct(capture, settings, lights, progress, checkpoints=kept)
+    reconstruction = reconstruct(capture, settings, lights, progress, checkpoints=kept, findings=findings)
     write(reconstruction, capture, settings, given.out, progress)
+    for one in findings:
+        print(f"{one.where}: {one.text}")
     print(f"{given.out}: {reconstruction.metrics['status']['name']}. {reconstruction.metrics['status']['text']}")
 
 

@@ -1,19 +1,24 @@
-"""Re-render views of a capture under their own lights, as its photographs were taken.
+"""Pictures of a result: a capture's views under their own lights, or any camera under any light.
 
     python -m mvps.render RESULT --capture CAPTURE --views 4,8 --out DIR
 
 writes DIR/view_04/001.png and so on: linear 16-bit RGB at the capture's exposure (65535 is what saturates the photographs),
-named by the lights' numbers, black where no surface is, and mask.png, white where one is.
+named by the lights' numbers, black where no surface is, and mask.png, white where one is. Given a light or a camera,
+
+    python -m mvps.render RESULT --turntable 72 --envmap studio.hdr --out DIR --video
+
+it writes DIR/turn_001_image.png and so on, a picture a camera and layer (new_pictures.py).
 """
 
 from __future__ import annotations
 
-from argparse import SUPPRESS
-from collections.abc import Sequence
+from argparse import SUPPRESS, ArgumentTypeError, Namespace
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mvps.command import number_list, parse, parser, run
+from mvps.command import number_list, parse, parser, positive, run
+from mvps.scene import CaptureError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,6 +30,9 @@ if TYPE_CHECKING:
 
 WHITE = 65535
 SAMPLES_PER_CHUNK = 1 << 22
+LAYERS = ("image", "albedo", "specular", "normals", "depth", "shadow", "confidence")
+"""What layers.py renders, by name; here, because --help does not wait for it."""
+FORMATS = ("png", "png16", "exr")
 
 
 def render_view(
@@ -90,27 +98,108 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
             stage.advance(1)
 
 
-def main(argv: Sequence[str]) -> None:
-    """The command line."""
+def numbers(counts: tuple[int, ...], wanted: str) -> Callable[[str], tuple[float, ...]]:
+    """A type for options of that many finite numbers, separated by commas; wanted: in words."""
+
+    def numbers_(text: str) -> tuple[float, ...]:
+        try:
+            found = tuple(float(word) for word in text.split(","))
+        except ValueError:
+            found = ()
+        if len(found) not in counts or not all(abs(x) < float("inf") for x in found):
+            raise ArgumentTypeError(f"wanted {wanted}, separated by commas, given {text!r}")
+        return found
+
+    return numbers_
+
+
+def size(text: str) -> tuple[int, int]:
+    """Width and height: "800x600"."""
+    words = text.lower().split("x")
+    if len(words) != 2 or not all(word.isdecimal() and 1 <= int(word) <= 16384 for word in words):
+        raise ArgumentTypeError(f"wanted width and height such as 800x600, up to 16384, given {text!r}")
+    return int(words[0]), int(words[1])
+
+
+def layer_list(text: str) -> tuple[str, ...]:
+    """Names of layers, separated by commas."""
+    names = tuple(word.strip() for word in text.split(","))
+    for name in names:
+        if name not in LAYERS:
+            raise ArgumentTypeError(f"wanted some of {', '.join(LAYERS)}, given {name!r}")
+    return tuple(dict.fromkeys(names))
+
+
+def options() -> Any:
+    """The command line's parser."""
     made = parser(
         "mvps.render",
-        "Re-render views of a capture from a result, each under its own lights, as linear 16-bit PNG files\n"
-        "DIR/view_04/001.png and so on, at the exposure of the photographs; mask.png beside them shows where the surface is.",
+        "Pictures of a result. With --capture alone: its views, each under its own lights, as linear 16-bit PNG files\n"
+        "DIR/view_04/001.png and so on, at the exposure of the photographs; mask.png beside them shows where the surface is.\n"
+        "With a light or a camera of your own: DIR/CAMERA_LAYER.png, transparent where nothing is.",
     )
     made.add_argument("result", type=Path, metavar="RESULT", help="folder that mvps.reconstruct wrote")
-    made.add_argument(
-        "--capture", type=Path, required=True, default=SUPPRESS, metavar="CAPTURE", help="folder of the photographs, for its cameras"
-    )
-    made.add_argument(
-        "--views",
-        type=number_list,
-        default=SUPPRESS,
-        metavar="N,N",
-        help="numbers of views, counted from 1; all of the result's if left out",
-    )
     made.add_argument("--out", type=Path, required=True, default=SUPPRESS, metavar="DIR", help="new folder for the images")
-    options = parse(made, argv)
-    render_views(options.result, options.capture, options.views if "views" in options else None, options.out)
+    vector, colour = numbers((3,), "three numbers"), numbers((3, 6), "three numbers, or six with red, green and blue")
+    cameras = made.add_argument_group("cameras", "of a capture, or one of the others; a turntable of one frame if none is given")
+    cameras.add_argument("--capture", type=Path, default=SUPPRESS, metavar="CAPTURE", help="folder of the photographs, for its cameras")
+    cameras.add_argument("--views", type=number_list, default=SUPPRESS, metavar="N,N", help="of the capture's views; all if left out")
+    cameras.add_argument("--camera", type=vector, default=SUPPRESS, metavar="X,Y,Z", help="place of a camera, world units")
+    cameras.add_argument("--target", type=vector, default=SUPPRESS, metavar="X,Y,Z", help="what it looks at; else the object's middle")
+    cameras.add_argument("--turntable", type=int, default=SUPPRESS, metavar="FRAMES", help="cameras evenly around the object")
+    cameras.add_argument("--elevation", type=float, default=15.0, metavar="DEG", help="of the turntable's cameras above the horizon")
+    cameras.add_argument("--cameras", type=Path, default=SUPPRESS, metavar="FILE", help=CAMERAS_HELP)
+    cameras.add_argument("--up", type=vector, default=(0.0, 0.0, 1.0), metavar="X,Y,Z", help=UP_HELP)
+    cameras.add_argument("--fov", type=positive, default=30.0, metavar="DEG", help="field of view of --camera and --turntable")
+    cameras.add_argument("--size", type=size, default=(640, 640), metavar="WxH", help="pixels of --camera and --turntable")
+    lights = made.add_argument_group("lights", "together; without any, one from above the camera's right shoulder")
+    lights.add_argument("--light", type=colour, action="append", default=[], metavar="X,Y,Z[,R,G,B]", help="towards a light; its intensity")
+    lights.add_argument("--point", type=colour, action="append", default=[], metavar="X,Y,Z[,R,G,B]", help=POINT_HELP)
+    lights.add_argument("--envmap", type=Path, default=SUPPRESS, metavar="FILE", help="environment map, .hdr or .exr, equirectangular")
+    lights.add_argument("--envmap-turn", type=float, default=0.0, metavar="DEG", help="turn of the environment about --up")
+    lights.add_argument("--envmap-lights", type=int, default=256, metavar="N", help="directional lights that stand for it")
+    lights.add_argument("--frame", choices=("world", "camera"), default="world", help=FRAME_HELP)
+    lights.add_argument("--no-bounce", action="store_true", help="without light that surfaces send each other")
+    pictures = made.add_argument_group("pictures")
+    pictures.add_argument("--layers", type=layer_list, default=("image",), metavar="NAMES", help=f"some of {','.join(LAYERS)}")
+    pictures.add_argument("--format", choices=FORMATS, default="png", help="8-bit sRGB, 16-bit linear, or EXR: values as they are")
+    pictures.add_argument(
+        "--exposure",
+        type=positive,
+        default=SUPPRESS,
+        metavar="X",
+        help=EXPOSURE_HELP,
+    )
+    pictures.add_argument("--video", action="store_true", help="an MP4 of each layer too (needs imageio-ffmpeg)")
+    pictures.add_argument("--edit", type=Path, default=SUPPRESS, metavar="FILE", help="edits of the material (docs/edits.md)")
+    return made
+
+
+CAMERAS_HELP = 'JSON: {"cameras": [{"name", "K", "rotation", "translation", "width", "height"}]}, camera_from_world, OpenCV axes'
+POINT_HELP = "place of a point of light, world units; its intensity at the object's middle"
+UP_HELP = "upwards in the world, for --camera, --turntable and --envmap"
+EXPOSURE_HELP = "factor of radiance; if left out, highlights of the first picture become white"
+FRAME_HELP = "of --light and --point; camera: x right, y up, z towards the camera, fixed to each camera, its origin in the object's middle"
+OWN = ("camera", "turntable", "cameras", "envmap")
+
+
+def asks_for_own(given: Namespace) -> bool:
+    """Whether the options want more than a capture's views under their own lights."""
+    plain = given.layers == ("image",) and given.format == "png" and not (given.video or "exposure" in given or "edit" in given)
+    return not plain or bool(given.light or given.point) or any(name in given for name in OWN)
+
+
+def main(argv: Sequence[str]) -> None:
+    """The command line."""
+    given = parse(options(), argv)
+    if not asks_for_own(given):
+        if "capture" not in given:
+            raise CaptureError("wanted --capture for the photographs' views, or a light or a camera, given neither; see --help")
+        render_views(given.result, given.capture, given.views if "views" in given else None, given.out)
+        return
+    from mvps.new_pictures import write_pictures
+
+    write_pictures(given)
 
 
 if __name__ == "__main__":

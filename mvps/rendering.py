@@ -10,7 +10,7 @@ The shading normal is the material's refined normal; shadows are traced on the m
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -40,6 +40,10 @@ class Points(NamedTuple):
     hit: Bool
     share: Float
     code: Float
+
+    def part(self, rows: Any) -> Points:
+        """Those of these rows."""
+        return Points(*(values[rows] for values in self))
 
 
 def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: Int) -> Points:
@@ -105,6 +109,17 @@ def specular_shading(normal: Float, towards: Float, direction: Float, weight: Fl
     return shaded
 
 
+def shaded(points: Points, view: Float, material: Material, direction: Float) -> NDArray[np.float32]:
+    """Radiance over intensity (n, lights, 3) at points seen along view (n, 3) under lights direction (lights, 3), or (n, lights, 3) where
+    every point has its own; attached shadows included, cast ones and inter-reflection not."""
+    arrays = (points.normal, view, direction, points.albedo, points.specular_weight)
+    normal, towards, light, albedo, weight = (torch.tensor(a, dtype=torch.float32) for a in arrays)
+    image: NDArray[np.float32] = shade(normal, towards, light, albedo, weight, material.law).numpy()
+    if material.residual is not None:
+        image *= factor(material.residual, points.share, points.code, points.normal, view, direction)[..., None]
+    return image
+
+
 def photograph(
     caster: RayCaster,
     material: Material,
@@ -122,17 +137,11 @@ def photograph(
     view = view_directions(camera, points.position)
     lit = ~shadow_at(caster, material.law, points, direction)
     image = np.empty((len(pixels), len(direction), 3), np.float32)
-    light = torch.tensor(direction, dtype=torch.float32)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(pixels), step):
         part = slice(start, start + step)
-        arrays = (points.normal, view, points.albedo, points.specular_weight)
-        normal, towards, albedo, weight = (torch.tensor(a[part], dtype=torch.float32) for a in arrays)
-        shaded = shade(normal, towards, light, albedo, weight, material.law).numpy()
-        image[part] = shaded * lit[part, :, None]
-        if material.residual is not None:
-            of_points = (points.share[part], points.code[part], points.normal[part], view[part])
-            image[part] *= factor(material.residual, *of_points, direction)[..., None]
+        of_part = points.part(part)
+        image[part] = shaded(of_part, view[part], material, direction) * lit[part, :, None]
         if arriving is not None:
-            image[part] += points.albedo[part, None].astype(np.float32) * arriving.at(points.position[part], points.mesh_normal[part])
+            image[part] += of_part.albedo[:, None].astype(np.float32) * arriving.at(of_part.position, of_part.mesh_normal)
     return image * intensity.astype(np.float32)

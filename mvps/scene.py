@@ -21,11 +21,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mvps.values import checked, unit
 
 Float = NDArray[np.floating[Any]]
 Int = NDArray[np.integer[Any]]
@@ -37,33 +40,6 @@ ROTATION_TOLERANCE = 1e-4
 
 class CaptureError(ValueError):
     """Something is wrong with what the user gave; the message says where, what was wanted, what was given, what to try."""
-
-
-def checked(
-    name: str,
-    value: Any,
-    shape: tuple[int | None, ...],
-    dtype: Any = np.float64,
-    finite: bool = True,
-) -> NDArray[Any]:
-    """`value` as a read-only array of `dtype` and `shape` (None matches any length); ValueError with wanted and given if not."""
-    array = np.asarray(value, dtype=dtype)
-    if array.ndim != len(shape) or any(w is not None and w != g for w, g in zip(shape, array.shape, strict=True)):
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-        raise ValueError(f"{name}: wanted shape {wanted}, given {array.shape}")
-    if finite and array.dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name}: wanted finite numbers, given {int((~np.isfinite(array)).sum())} NaN or infinite")
-    if array.flags.writeable:
-        array = array.view()
-        array.flags.writeable = False
-    return array
-
-
-def _unit(name: str, vectors: NDArray[Any]) -> None:
-    length = np.linalg.norm(vectors, axis=-1)
-    if length.size and np.abs(length - 1).max() > 1e-3:
-        worst = float(length.flat[int(np.abs(length - 1).argmax())])
-        raise ValueError(f"{name}: wanted unit vectors, given one of length {worst:.4g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +86,8 @@ class View:
     scale       radiance = samples * scale
     saturation  code value at and above which a sample is clipped and no data
     lights      numbers of the photographs' lights, counted from 1 as in the files
+    frame       (height, width) mean code value of every pixel over lights and channels, the background's too; None where not known
+    files       the photographs, in the order of `lights`; none where they were not read from files
     """
 
     name: str
@@ -119,6 +97,8 @@ class View:
     scale: float
     saturation: int
     lights: tuple[int, ...]
+    frame: NDArray[np.float32] | None = None
+    files: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mask", checked("mask", self.mask, (self.camera.height, self.camera.width), bool))
@@ -153,6 +133,11 @@ class View:
         return self._unclipped[:, lights]
 
     @cached_property
+    def shown(self) -> Bool:
+        """(lights,) True where a photograph has a usable sample: one that was left out (`Capture.without`) has none."""
+        return np.asarray(self._unclipped.any(axis=0))
+
+    @cached_property
     def _unclipped(self) -> Bool:
         below = self.samples < self.saturation
         return below[..., 0] & below[..., 1] & below[..., 2]
@@ -178,7 +163,7 @@ class Lights:
         object.__setattr__(self, "direction", tuple(checked("light direction", d, (None, 3)) for d, _ in pairs))
         object.__setattr__(self, "intensity", tuple(checked("light intensity", e, (len(d), 3)) for d, e in pairs))
         for direction, intensity in zip(self.direction, self.intensity, strict=True):
-            _unit("light direction", direction)
+            unit("light direction", direction)
             if (intensity <= 0).any():
                 raise ValueError(f"light intensity: wanted positive numbers, given {float(intensity.min()):.4g}")
 
@@ -197,6 +182,18 @@ class Capture:
         if len(set(names)) != len(names):
             raise ValueError(f"views: wanted distinct names, given {names}")
 
+    def without(self, photographs: Mapping[str, Sequence[int]]) -> Capture:
+        """The capture in which these photographs, numbers of lights by view name, are no data: all their samples count as saturated."""
+        views = []
+        for view in self.views:
+            if photographs.get(view.name):
+                samples = view.samples.copy()
+                samples[:, [view.lights.index(number) for number in photographs[view.name]]] = view.saturation
+                views.append(replace(view, samples=samples))
+            else:
+                views.append(view)
+        return Capture(self.name, tuple(views))
+
     def select(self, keep: Mapping[str, Sequence[int]]) -> Capture:
         """The capture with only the views named in `keep`, each with only the lights of these numbers."""
         views = []
@@ -206,7 +203,8 @@ class Capture:
                 views.append(view)
             elif view.name in keep:
                 positions = [view.lights.index(number) for number in keep[view.name]]
-                views.append(replace(view, samples=view.samples[:, positions], lights=tuple(keep[view.name])))
+                files = tuple(view.files[at] for at in positions) if view.files else ()
+                views.append(replace(view, samples=view.samples[:, positions], lights=tuple(keep[view.name]), files=files))
         return Capture(self.name, tuple(views))
 
 
@@ -233,7 +231,7 @@ class NormalMap:
         object.__setattr__(self, "normal", checked("normal", self.normal, (n, 3), np.float32))
         object.__setattr__(self, "albedo", checked("albedo", self.albedo, (n, 3), np.float32))
         object.__setattr__(self, "confidence", checked("confidence", self.confidence, (n,), np.float32))
-        _unit("normal", self.normal)
+        unit("normal", self.normal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +337,7 @@ class Material:
         weight_shape = (n, lobes, 3) if np.ndim(self.specular_weight) == 3 else (n, lobes)
         object.__setattr__(self, "specular_weight", checked("specular_weight", self.specular_weight, weight_shape))
         object.__setattr__(self, "confidence", checked("confidence", self.confidence, (n,)))
-        _unit("normal", self.normal)
+        unit("normal", self.normal)
         if (self.albedo < 0).any() or (self.specular_weight < 0).any():
             raise ValueError("material: wanted non-negative albedo and specular_weight, given a negative one")
         if self.residual is not None and len(self.residual.share) != n:
@@ -422,8 +420,8 @@ class Truth:
             arrays = {view: checked(f"{name} of {view}", array, shape, dtype, finite) for view, array in given.items()}
             object.__setattr__(self, name, MappingProxyType(arrays))
         for view, normals in self.normals.items():
-            _unit(f"normals of {view}", normals[np.isfinite(normals).all(-1)])
+            unit(f"normals of {view}", normals[np.isfinite(normals).all(-1)])
         for view, direction in self.direction.items():
-            _unit(f"direction of {view}", direction)
+            unit(f"direction of {view}", direction)
         if any((intensity <= 0).any() for intensity in self.intensity.values()):
             raise ValueError("intensity: wanted positive numbers, given one that is not")

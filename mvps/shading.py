@@ -68,15 +68,20 @@ def returned(sharpness: tuple[float, ...], microfacet: bool) -> NDArray[np.float
     return np.array([1.0, *(4 * (1 - low) * float(weight @ (value * (2 * u**2 - 1) * u)) for value in values)])
 
 
+def against(vectors: Tensor, light: Tensor) -> Tensor:
+    """(points, lights) dot products of vectors (points, 3) with lights (lights, 3), or with each point's own (points, lights, 3)."""
+    return vectors @ light.T if light.ndim == 2 else (light @ vectors[..., None])[..., 0]
+
+
 def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_weight: Tensor, law: Law) -> Tensor:
     """Radiance over intensity (points, lights, 3), attached shadow included, cast shadow not.
 
-    normal, view (points, 3) unit; light (lights, 3) unit; albedo (points, 3); specular_weight (points, lobes) or
-    (points, lobes, 3). All in one frame.
+    normal, view (points, 3) unit; light (lights, 3) unit, or (points, lights, 3) where every point has its own; albedo (points, 3);
+    specular_weight (points, lobes) or (points, lobes, 3). All in one frame.
     """
-    n_dot_l = normal @ light.T
+    n_dot_l = against(normal, light)
     n_dot_v = (normal * view).sum(-1, keepdim=True)
-    h_dot_n = half_dot_normal(n_dot_v, n_dot_l, view @ light.T)
+    h_dot_n = half_dot_normal(n_dot_v, n_dot_l, against(view, light))
     D_l, D_v = (1 + law.grazing * (1 - x.clamp_min(0)) ** GRAZING_POWER for x in (n_dot_l, n_dot_v))
     weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None].expand(-1, -1, 3)
     specular = lobes(h_dot_n, law) @ weight

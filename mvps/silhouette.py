@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from mvps.camera import footprint, project, rays
+from mvps.camera import footprint, inside_image, project, rays
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise
-from mvps.scene import Bool, Camera, Capture, Float, Int
+from mvps.scene import Bool, Camera, Capture, Float, Int, View
 from mvps.visibility import RayCaster
 
 STAIRCASE_PIXELS = 1.0
@@ -66,15 +66,14 @@ def mask_distance(mask: Bool) -> NDArray[np.float32]:
     return smooth
 
 
-_distances: WeakKeyDictionary[Capture, list[NDArray[np.float32]]] = WeakKeyDictionary()
+_distances: WeakKeyDictionary[View, NDArray[np.float32]] = WeakKeyDictionary()
 
 
 def mask_distances(capture: Capture) -> list[NDArray[np.float32]]:
-    """`mask_distance` of every view, made once for a capture, on all cores."""
-    found = _distances.get(capture)
-    if found is None:
-        found = _distances[capture] = on_cores(mask_distance, [view.mask for view in capture.views])
-    return found
+    """`mask_distance` of every view, made once for a view, on all cores."""
+    new = [view for view in capture.views if view not in _distances]
+    _distances.update(zip(new, on_cores(mask_distance, [view.mask for view in new]), strict=True))
+    return [_distances[view] for view in capture.views]
 
 
 def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:
@@ -86,6 +85,19 @@ def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_R
         part = at[None, start : start + REMAP_LIMIT]
         values[start : start + part.shape[1]] = cv2.remap(field, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=border)[0]
     return values
+
+
+def beyond_mask(camera: Camera, field: NDArray[np.float32], image: Float) -> NDArray[np.float32]:
+    """Signed distance (n,) in pixels of image coordinates (n, 2) to a mask, negative inside; field: its `mask_distance`.
+
+    Beyond the image nothing was photographed: there it is outside, at least by its distance to the image.
+    """
+    pixels = sampled(field, image)
+    outside = np.flatnonzero(~inside_image(camera, image))
+    limit = np.array([camera.width, camera.height])
+    beyond = lengths(np.maximum(np.maximum(-image[outside], image[outside] - limit), 0))
+    pixels[outside] = np.maximum(pixels[outside], 0.5) + beyond
+    return pixels
 
 
 def outline(caster: RayCaster, camera: Camera) -> Outline:

@@ -16,11 +16,12 @@ from mvps.joint.lambertian import lambertian
 from mvps.joint.thinned import thinned
 from mvps.measures import mesh_normals
 from mvps.occupancy import Occupancy, OccupancySettings
+from mvps.outcome import all_lights, versions
 from mvps.photometric import normal_maps
 from mvps.plan import Parts, first_pass
 from mvps.progress import Progress
 from mvps.radiance import RadianceSettings, radiance_surface
-from mvps.reconstruct import Settings, all_lights, first_lights, parted, rough_shape, stage_one, stage_two, versions
+from mvps.reconstruct import Settings, first_lights, parted, rough_shape, stage_one, stage_two
 from mvps.scene import Capture, Lights, Reconstruction, Surface
 from mvps.visibility import ray_caster
 

@@ -100,11 +100,12 @@ def bake(surface: Surface, material: Material, lights: Lights, capture: Capture,
 
 
 def png_bytes(image: NDArray[Any]) -> bytes:
-    """An RGB or grey image (height, width[, 3]) of 8 or 16 bit as a PNG file. ValueError where it is another kind of array."""
+    """An RGB or grey image (height, width[, 3]) of 8 or 16 bit as a PNG file, or with transparency (height, width, 4). ValueError where it
+    is another kind of array."""
     # OpenCV stores other depths as 8 bit without an error.
-    if image.dtype not in (np.uint8, np.uint16) or not image.size or image.shape[2:] not in ((), (3,)):
-        raise ValueError(f"image: wanted (height, width[, 3]) uint8 or uint16, not empty, given {image.shape} {image.dtype}")
-    stored = image[..., ::-1] if image.ndim == 3 else image
+    if image.dtype not in (np.uint8, np.uint16) or not image.size or image.shape[2:] not in ((), (3,), (4,)):
+        raise ValueError(f"image: wanted (height, width[, 3 or 4]) uint8 or uint16, not empty, given {image.shape} {image.dtype}")
+    stored = image[..., [2, 1, 0, 3][: image.shape[2]]] if image.ndim == 3 else image
     data: bytes = cv2.imencode(".png", np.ascontiguousarray(stored))[1].tobytes()
     return data
 

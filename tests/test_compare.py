@@ -15,6 +15,7 @@ import pytest
 from mvps.command import run
 from mvps.compare.__main__ import main
 from mvps.compare.curve import Point, dominated, drawings, points_of, ticks
+from mvps.compare.page import page_html
 from mvps.compare.pictures import cropped, error_picture
 from mvps.compare.running import Run, known_runs
 from mvps.compare.tables import as_csv, as_markdown, as_text, protocol_rows, rows
@@ -47,6 +48,15 @@ def test_table_pictures_and_meshes(compared: Path) -> None:
     assert picture is not None and picture.std() > 20
     assert (compared / "hull" / "mesh.ply").is_file()
     assert "| method |" in (compared / "table.md").read_text()
+    page = (compared / "report.html").read_text()
+    assert "<td>hull</td>" in page and "data:image/png;base64," in page and "<svg" not in page
+
+
+def test_the_page_shows_curves_after_the_first_table() -> None:
+    page = page_html(
+        "a <b>", {"first": [["method", "s"], ["x", "1"]], "second": [["method", "s"], ["y", "2"]]}, {"error": "<svg></svg>"}, None
+    )
+    assert "Methods on a &lt;b&gt;" in page and page.index("first") < page.index("<svg>") < page.index("second")
 
 
 def test_what_is_there_is_not_run_again(capture: Path, compared: Path) -> None:

@@ -17,7 +17,7 @@ import scipy.io
 import trimesh
 
 from mvps.camera import pixel_centres, rays
-from mvps.load import read_calibrated_lights, read_capture, read_truth
+from mvps.load import read_calibrated_lights, read_capture, read_truth, with_mask
 from mvps.load.images import clip_level
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import CaptureError, View
@@ -94,6 +94,27 @@ def test_code_values_cameras_and_order_come_back(capture: Path) -> None:
         np.testing.assert_allclose(view.camera.rotation, rotation(number))
         np.testing.assert_allclose(view.camera.translation, translation(number)[:, 0])
         assert view.scale == 1 / 65535 and view.saturation == 65535
+
+
+def test_frames_are_the_mean_of_whole_photographs(capture: Path) -> None:
+    for number, view in enumerate(read_capture(capture, lights=[1, 3]).views, 1):
+        whole = np.stack([photograph(number, light) for light in (1, 3)]).astype(float)
+        np.testing.assert_allclose(view.frame, whole.mean((0, 3)), rtol=1e-6)
+        assert [file.name for file in view.files] == ["001.png", "003.png"]
+
+
+def test_another_mask_reads_what_it_adds_and_keeps_the_rest(capture: Path) -> None:
+    read = read_capture(capture).without({"view_01": [2]})
+    other = mask() > 127
+    other[0:3, 4:8], other[8] = True, False
+    for number, view in enumerate(read.views, 1):
+        changed = with_mask(view, other)
+        expected = np.stack([photograph(number, light)[other] for light in range(1, LIGHTS + 1)], 1)
+        if number == 1:
+            expected[:, 1] = 65535
+        np.testing.assert_array_equal(changed.samples, expected)
+        np.testing.assert_array_equal(changed.mask, other)
+        assert changed.lights == view.lights and changed.camera is view.camera
 
 
 @pytest.mark.parametrize(("scene", "shift"), [(None, 0.5), ("{}", 0.5), ('{"pixel_center": 0}', 0.5), ('{"pixel_center": 1}', -0.5)])
@@ -311,9 +332,9 @@ COMPLAINTS: list[tuple[Callable[[Path], None], dict[str, Any], list[str]]] = [
     (write("scene.json", b"\xff\xfe\xff"), {}, ["scene.json: wanted a JSON object"]),
     (write("scene.json", b""), {}, ["scene.json", "0 bytes"]),
     (write("scene.json", b"[]"), {}, ["scene.json: wanted a JSON object, given list"]),
-    (write("scene.json", b'{"pixel_center": "half"}'), {}, ["wanted a number as pixel_center, given 'half'"]),
+    (write("scene.json", b'{"pixel_center": "half"}'), {}, ["wanted a number as pixel_center, from 0 to 1, given 'half'"]),
     (write("scene.json", b'{"pixel_center": true}'), {}, ["given True"]),
-    (write("scene.json", b'{"pixel_center": NaN}'), {}, ["given nan"]),
+    (write("scene.json", b'{"pixel_center": NaN}'), {}, ["the number NaN, which is not finite"]),
     (remove("view_01/mask.png"), {}, ["view_01/mask.png: wanted a mask", "no such file"]),
     (image("view_01/mask.png", np.zeros((HEIGHT, WIDTH), np.uint8) + 127), {}, ["some foreground", "largest value 127"]),
     (image("view_01/mask.png", np.full((HEIGHT, WIDTH), 255, np.uint8)), {}, ["some background"]),
@@ -478,7 +499,7 @@ def test_complaint_about_the_truth(with_truth: Path, name: str, content: bytes, 
 
 def test_complaints_about_the_shape_of_the_truth(with_truth: Path) -> None:
     scipy.io.savemat(with_truth / "view_01" / "Normal_gt.mat", {"Normal_gt": np.zeros((2, 2, 3))})
-    with pytest.raises(CaptureError, match=r"Normal_gt of shape \(12, 16, 3\) as in mask.png, given float64 of shape \(2, 2, 3\)"):
+    with pytest.raises(CaptureError, match=r"Normal_gt of shape \(12, 16, 3\) as in mask.png, given double of shape \(2, 2, 3\)"):
         read_truth(with_truth)
     scipy.io.savemat(with_truth / "view_01" / "Normal_gt.mat", {"other": 1})
     with pytest.raises(CaptureError, match="a variable Normal_gt"):

@@ -173,7 +173,7 @@ def test_bad_input_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path, 
     assert run(reconstruct.main, [str(tmp_path / "nowhere"), "--out", str(out)]) == 2
     assert run(reconstruct.main, [str(capture), "--out", str(out), "--views", "1,77", "--quiet"]) == 2
     assert run(reconstruct.main, [str(capture), "--out", str(out), "--hold-out-views", "1,2,3,4,5,6,7,8", "--quiet"]) == 2
-    assert run(reconstruct.main, [str(capture), "--out", str(out), "--views", "1", "--quiet"]) == 2
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--views", "1", "--lights", "1,2,3", "--quiet"]) == 2
     said = capsys.readouterr().err
     assert all(line.startswith("mvps: ") for line in said.strip().splitlines() if "wanted" in line) and said.count("wanted") == 4
     assert list(tmp_path.iterdir()) == []

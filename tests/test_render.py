@@ -13,6 +13,7 @@ from sphere_scene import SphereScene, make_sphere
 import mvps.render
 from mvps.command import run
 from mvps.export import write_reconstruction
+from mvps.load import read_environment
 from mvps.render import main, render_view
 from mvps.scene import CaptureError, Lights, Truth, View
 from mvps.synthetic.files import write_capture
@@ -121,3 +122,68 @@ def test_messages(folders: tuple[Path, Path], scene: SphereScene, tmp_path: Path
     assert not out.exists()
     with pytest.raises(CaptureError, match="given view_05"):
         render_view(RayCaster(scene.reconstruction.surface), scene.reconstruction, "view_05", scene.capture.views[0].camera)
+
+
+def rendered_files(folders: tuple[Path, Path], out: Path, *options: str) -> list[str]:
+    assert run(main, [str(folders[0]), "--out", str(out), "--quiet", *options]) == 0
+    return sorted(path.name for path in out.iterdir())
+
+
+def test_a_turntable_under_an_environment(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "sky.hdr"), np.ones((8, 16, 3), np.float32))
+    options = ["--turntable", "2", "--envmap", str(tmp_path / "sky.hdr"), "--envmap-lights", "32", "--size", "40x30", "--video"]
+    names = rendered_files(folders, tmp_path / "out", *options, "--layers", "image,depth")
+    wanted = ["depth.mp4", "image.mp4", *(f"turn_000{k}_{layer}.png" for k in (1, 2) for layer in ("depth", "image"))]
+    assert names == wanted
+    shown = cv2.imread(str(tmp_path / "out" / "turn_0001_image.png"), cv2.IMREAD_UNCHANGED)
+    assert shown is not None and shown.shape == (30, 40, 4)
+    assert shown[15, 20, 3] == 255 and shown[0, 0, 3] == 0 and 30 < shown[15, 20, :3].mean() < 255
+    video = cv2.VideoCapture(str(tmp_path / "out" / "image.mp4"))
+    assert video.read()[1][0, 0].min() > 240
+
+
+@pytest.mark.parametrize("form", ["png16", "exr"])
+def test_values_as_they_are(folders: tuple[Path, Path], scene: SphereScene, tmp_path: Path, form: str) -> None:
+    view = scene.capture.views[0]
+    light = ",".join(f"{x:.9g}" for x in (*scene.reconstruction.lights.direction[0][0], *scene.reconstruction.lights.intensity[0][0]))
+    options = ["--capture", str(folders[1]), "--views", "1", f"--light={light}", "--format", form, "--exposure", "1"]
+    rendered_files(folders, tmp_path / "out", *options)
+    if form == "exr":
+        found = read_environment(tmp_path / "out" / "view_01_image.exr")
+    else:
+        found = image(tmp_path / "out" / "view_01_image.png") / 65535
+    photographed = np.zeros_like(found)
+    photographed[view.mask] = view.radiance()[:, 0]
+    inner = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5))) > 0
+    np.testing.assert_allclose(found[inner].clip(0, 1), photographed[inner].clip(0, 1), atol=0.02)
+
+
+def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "edits.json").write_text('{"edits": [{"albedo": {"colour": [0, 1, 0]}}]}')
+    options = ["--camera", "400,0,0", "--light=-1,0,0.1", "--frame", "camera", "--size", "40x40", "--edit", str(tmp_path / "edits.json")]
+    assert rendered_files(folders, tmp_path / "out", *options) == ["camera_image.png"]
+    shown = image(tmp_path / "out" / "camera_image.png").astype(int)
+    left, right = shown[20, 15], shown[20, 25]
+    assert left.sum() > right.sum()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--layers", "image,colour"], "wanted some of image"),
+        (["--light", "1,2"], "wanted three numbers"),
+        (["--light", "0,0,0"], "wanted a direction"),
+        (["--light", "0,0,1,1,-1,1"], "wanted intensities"),
+        (["--turntable", "0"], "wanted 1 to 9999 frames"),
+        (["--size", "10"], "wanted width and height"),
+        (["--envmap", "nowhere.hdr"], "nowhere.hdr: wanted an environment map"),
+        (["--cameras", "nowhere.json"], "nowhere.json"),
+        (["--camera", "0,0,0", "--target", "0,0,0"], "wanted an eye away"),
+        ([], "wanted --capture"),
+    ],
+)
+def test_bad_options_write_nothing(
+    folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    assert run(main, [str(folders[0]), "--out", str(tmp_path / "out"), *options]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mvps.scene import Camera, Capture, Lights, Material, NormalMap, Reconstruction, Surface, Truth, View, checked
+from mvps.scene import Camera, Capture, Lights, Material, NormalMap, Reconstruction, Surface, Truth, View
+from mvps.values import checked
 
 K = np.array([[100.0, 0, 4], [0, 100, 3], [0, 0, 1]])
 MASK = np.zeros((6, 8), bool)
@@ -143,3 +144,11 @@ def test_truth_keeps_nan_outside_the_mask() -> None:
     normals = np.full((2, 2, 3), np.nan)
     normals[0, 0] = (0, 0, 1)
     assert np.isnan(truth(normals={"view_01": normals}).normals["view_01"]).sum() == 9
+
+
+def test_photographs_that_are_no_data() -> None:
+    whole = Capture("a", (view(), view(name="view_02")))
+    part = whole.without({"view_02": [5]})
+    assert part.views[0] is whole.views[0]
+    assert part.views[1].usable().any(0).tolist() == [True, True, False, True]
+    assert np.array_equal(part.views[1].samples[:, [0, 1, 3]], whole.views[1].samples[:, [0, 1, 3]])

@@ -411,6 +411,6 @@ def test_messages(scene: SphereScene) -> None:
     few = Lights(r.lights.direction[:2], r.lights.intensity[:2], True)
     with pytest.raises(ValueError, match=r"lights: wanted one per photograph of every view \(\[10, 10, .*given \[10, 10\]"):
         bake(r.surface, r.material, few, scene.capture, 2)
-    for image in (np.zeros((2, 2, 4), np.uint8), np.zeros((2, 2), np.int64), np.zeros((0, 2), np.uint8)):
+    for image in (np.zeros((2, 2, 5), np.uint8), np.zeros((2, 2), np.int64), np.zeros((0, 2), np.uint8)):
         with pytest.raises(ValueError, match="image: wanted"):
             png_bytes(image)

@@ -64,7 +64,8 @@ def main(argv: Sequence[str]) -> None:
     made = parser(
         "mvps.compare",
         "Run methods on a capture, each in a process of its own, and set them side by side: a table (DIR/table.md, .csv, .json),\n"
-        "pictures of normals and their errors, the meshes (DIR/METHOD). What DIR holds already is not run again.\n\n" + listed_methods(),
+        "pictures of normals and their errors, all of it on one page (DIR/report.html), the meshes (DIR/METHOD). What DIR\n"
+        "holds already is not run again.\n\n" + listed_methods(),
     )
     made.add_argument("capture", type=Path, help="folder in the DiLiGenT-MV layout")
     made.add_argument("--methods", type=method_list, default="ours,ours-draft,hull", metavar="NAME,NAME", help="some of the above")
@@ -82,8 +83,9 @@ def main(argv: Sequence[str]) -> None:
     )
     given = parse(made, argv)
     from mvps.compare.curve import drawings
+    from mvps.compare.page import page_html
     from mvps.compare.running import run_all
-    from mvps.compare.tables import protocol_rows, rows, write_tables
+    from mvps.compare.tables import heading, protocol_rows, rows, write_tables
 
     texts = {name: getattr(given, name.replace("-", "_"), None) for name in OPTIONS}
     options = [f"--{name}={text}" for name, text in texts.items() if text is not None]
@@ -92,14 +94,18 @@ def main(argv: Sequence[str]) -> None:
     chosen = [runs[name] for name in methods]
     if all(one.failed for one in chosen):
         raise CaptureError(chosen[0].failed)
-    if given.curve:
-        for key, text in drawings(chosen).items():
-            (given.out / f"curve_{key}.svg").write_text(text, encoding="utf-8")
+    curves = drawings(chosen) if given.curve else {}
+    for key, text in curves.items():
+        (given.out / f"curve_{key}.svg").write_text(text, encoding="utf-8")
     done = [one for one in chosen if not one.failed]
     write_pictures(given.capture, [one.method for one in done], given.out)
     printed = given.published or diligent_object(given.capture.name, *capture_size(given.capture)) or AVERAGE
     tables = {"ours": rows(chosen)} | {name: protocol_rows(name, done, printed) for name in given.protocols if name != "ours"}
     print(write_tables(tables, given.out))
+    picture = given.out / "normals.png"
+    headed = {heading(name): lines for name, lines in tables.items()}
+    page = page_html(given.capture.name, headed, curves, picture.read_bytes() if picture.exists() else None)
+    (given.out / "report.html").write_text(page, encoding="utf-8")
 
 
 if __name__ == "__main__":

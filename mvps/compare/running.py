@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -15,8 +16,10 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from mvps.evaluate import evaluate_result, write_json
+from mvps.inputs import DAMAGED, JSON_LIMIT, parsed_json, read_file
 from mvps.load import read_truth
 from mvps.progress import Progress
 from mvps.scene import CaptureError
@@ -46,12 +49,17 @@ def known_runs(out: Path) -> dict[str, Run]:
     if not path.exists():
         return {}
     try:
-        records = json.loads(path.read_text(encoding="utf-8"))
-        return {
-            name: Run(**{**record, **{key: tuple(record[key]) for key in ("options", "protocols")}}) for name, record in records.items()
-        }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return {name: _known_run(record) for name, record in parsed_json(read_file(path, JSON_LIMIT)).items()}
+    except DAMAGED as error:
         raise CaptureError(f"{path}: wanted the record of a comparison, given something else ({error}); give another --out") from error
+
+
+def _known_run(record: dict[str, Any]) -> Run:
+    run = Run(**{**record, **{key: tuple(record[key]) for key in ("options", "protocols")}})
+    numbers = [run.seconds, run.processor_seconds, run.peak_memory_mb, *run.errors.values()]
+    if not all(isinstance(number, int | float) for number in numbers) or not isinstance(run.failed, str) or not isinstance(run.status, str):
+        raise ValueError(f"{run.method}: wanted numbers and texts, given other values")
+    return run
 
 
 def run_all(
@@ -89,6 +97,9 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
         raise KeyboardInterrupt
     if code == 2:
         return Run(name, tuple(options), seconds, busy, failed=said.splitlines()[-1].removeprefix("mvps: "))
+    if code < 0:
+        why = f"ended by signal {-code}" + (", as a system without memory sends it" if code == -signal.SIGKILL else "")
+        return Run(name, tuple(options), seconds, busy, failed=why)
     if code:
         raise RuntimeError(f"{' '.join(command)}: exit code {code}\n{said}")
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))

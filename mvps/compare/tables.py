@@ -84,13 +84,17 @@ def as_csv(lines: list[list[str]]) -> str:
     return text.getvalue()
 
 
+def heading(protocol: str) -> str:
+    """The protocol with what it measures."""
+    return f"{protocol}: {PROTOCOLS[protocol]}"
+
+
 def write_tables(tables: Mapping[str, list[list[str]]], out: Path) -> str:
     """Tables by protocol as table.md, table.json and a CSV each (table.csv by our own measures, table_PROTOCOL.csv) in `out`; as text."""
     for name, lines in tables.items():
         (out / ("table.csv" if name == "ours" else f"table_{name}.csv")).write_text(as_csv(lines), encoding="utf-8")
     records = {name: [dict(zip(lines[0], line, strict=True)) for line in lines[1:]] for name, lines in tables.items()}
     write_json(out / "table.json", records)
-    heads = {name: f"{name}: {PROTOCOLS[name]}" for name in tables}
-    page = "\n\n".join(f"## {heads[name]}\n\n{as_markdown(lines)}" for name, lines in tables.items())
+    page = "\n\n".join(f"## {heading(name)}\n\n{as_markdown(lines)}" for name, lines in tables.items())
     (out / "table.md").write_text(page + "\n", encoding="utf-8")
-    return "\n\n".join(f"{heads[name]}\n{as_text(lines)}" for name, lines in tables.items())
+    return "\n\n".join(f"{heading(name)}\n{as_text(lines)}" for name, lines in tables.items())

@@ -27,8 +27,8 @@ def _vertices(material: Material, device: torch.device) -> Vertices:
     weight = material.specular_weight.mean(2) if material.specular_weight.ndim == 3 else material.specular_weight
     reflectance = np.column_stack([material.albedo.mean(1), weight])
     normal, values = (torch.tensor(a, dtype=torch.float32, device=device) for a in (material.normal, reflectance))
-    # Residuals of about a tenth of the albedo are outliers until the lights are known.
-    return Vertices(normal, values, 0.1 * values[:, 0].clamp_min(1e-6))
+    # Residuals of about a tenth of the reflectance are outliers until the lights are known.
+    return Vertices(normal, values, 0.1 * values.sum(1).clamp_min(1e-6))
 
 
 def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[torch.Tensor], one_rig: bool) -> list[torch.Tensor]:
@@ -41,7 +41,11 @@ def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[to
     if one_rig:
         sums = [(torch.stack([H for H, _ in sums]).sum(0), torch.stack([g for _, g in sums]).sum(0))] * len(sums)
     eye = torch.eye(3, device=vertices.normal.device)
-    return [torch.linalg.solve(H + 1e-6 * H.diagonal(dim1=1, dim2=2).mean() * eye, g[..., None])[..., 0] for H, g in sums]
+    damping = [(1e-6 * H.diagonal(dim1=1, dim2=2).mean()).clamp_min(1e-12) for H, _ in sums]
+    solved = [torch.linalg.solve(H + d * eye, g[..., None])[..., 0] for (H, g), d in zip(sums, damping, strict=True)]
+    # A photograph that was left out says nothing of its light: at the camera.
+    toward = torch.tensor([0.0, 0.0, -1.0], device=eye.device)
+    return [torch.where(m.norm(dim=1, keepdim=True) > 0, m, toward) for m in solved]
 
 
 def _step(

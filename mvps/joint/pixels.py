@@ -52,7 +52,7 @@ def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: 
 
 def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
     """(n, 3) share of the channels in a pixel's radiance under white light, mean 1."""
-    white = (view.samples[rows] * (1 / channel_ratio(intensity)).astype(np.float32)).sum(1)
+    white = (view.samples[rows] * (view.shown[:, None] / channel_ratio(intensity)).astype(np.float32)).sum(1)
     chroma: NDArray[np.float32] = white / np.maximum(white.mean(1, keepdims=True), 1e-12)
     return chroma
 
@@ -88,7 +88,7 @@ def pixel_normals(
     spread = torch.cat([ALBEDO_TIE * reflectance[:, :1], WEIGHT_TIE * (reflectance[:, :1] + reflectance[:, 1:])], 1)
     anchor = Anchor(normal, NORMAL_TIE, reflectance, spread.clamp_min(1e-6 * float(spread.max())))
     lights = [DirectionalLights(light, grey)]
-    state = Vertices(normal, reflectance, reflectance[:, 0].median().expand(len(hit)))
+    state = Vertices(normal, reflectance, reflectance.sum(1).median().expand(len(hit)))
     for _ in range(QUICK_STEPS):
         state = vertex_step([samples.of_lights(quick)], state, [lights[0].of(quick)], material.law, anchor, stated=False)
     state = vertex_step([samples], state, lights, material.law, anchor)

@@ -38,7 +38,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import fuse, with_masks
-from mvps.material import LARGEST, Model, Trial
+from mvps.material import LARGEST, POOR_FIT, Model, Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
@@ -60,9 +60,6 @@ STILL = 0.5
 MOSTLY = 0.5
 """Part of a mesh's edges that creases split, above which the object has more detail than the mesh: halves of these are split once more.
 Four captures lie at 0.31 to 0.38 and 0.54 to 0.60 (docs/method.md)."""
-
-POOR_FIT = 0.1
-"""Relative residual above which the model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy objects."""
 
 
 @dataclass(frozen=True)
@@ -105,8 +102,8 @@ class RefineSettings:
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """surface, material and lights; maps: per view its pixels' normals; per round what changed; status in words, and a sentence; carried:
-    the surface with what its vertices were solved to, from which later rounds may go on."""
+    """surface, material and lights; maps: per view its pixels' normals; per round what changed; whether the last step was small, in words,
+    and a sentence; carried: the surface with what its vertices were solved to, from which later rounds may go on."""
 
     surface: Surface
     material: Material
@@ -208,7 +205,7 @@ def refine(
         before = round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
-    return replace(_finished(state, settings, account, device, generator), carried=carried)
+    return replace(finished(state, settings, account, device, generator), carried=carried)
 
 
 def _coloured(state: State, neural: bool, device: torch.device, generator: np.random.Generator) -> Material:
@@ -232,7 +229,7 @@ def _coloured(state: State, neural: bool, device: torch.device, generator: np.ra
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 
 
-def _finished(
+def finished(
     state: State, settings: RefineSettings, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
 ) -> Refined:
     """What the rounds came to; in colour if that is final."""
@@ -240,24 +237,20 @@ def _finished(
     material = (
         _coloured(state, settings.model.neural, device, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
     )
-    status, text = _verdict(account)
+    status, text = _settled(account)
     return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
 
 
-def _verdict(account: list[dict[str, float]]) -> tuple[str, str]:
-    """Status and a sentence, from residual and last change alone."""
+def _settled(account: list[dict[str, float]]) -> tuple[str, str]:
+    """Status and a sentence, from the last change alone."""
     last = account[-1]
-    if last["residual"] > POOR_FIT:
-        return "poor fit", (
-            f"The model fits badly: it leaves {100 * last['residual']:.0f} % of the images' signal unexplained (good fits leave under"
-            f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks"
-            " or poses."
-        )
     enough = STILL * last["stated_error_deg"]
-    if last["last_step_deg"] > enough or last["light_step_deg"] > STILL_DEG:
+    # Where normals are known to some degrees only, so are the lights that they were solved with.
+    enough_light = max(STILL_DEG, enough)
+    if last["last_step_deg"] > enough or last["light_step_deg"] > enough_light:
         return "not settled", (
             f"In the last step normals still turned by {last['last_step_deg']:.2f} deg (settled below {enough:.2f}, half their standard"
-            f" error), lights by {last['light_step_deg']:.2f} deg (settled below {STILL_DEG}); a finer preset does more rounds."
+            f" error), lights by {last['light_step_deg']:.2f} deg (settled below {enough_light:.2f}); a finer preset does more rounds."
         )
     return "converged", (
         f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last step normals turned by"

@@ -118,6 +118,8 @@ def _ratios(sums: list[tuple[Float, Float]], one_rig: bool) -> list[Float]:
     if one_rig:
         sums = [(np.sum([t for t, _ in sums], axis=0), np.sum([b for _, b in sums], axis=0))] * len(sums)
     ratios = [top / np.maximum(bottom, 1e-300) for top, bottom in sums]
+    # Of a photograph that was left out no sample speaks: white.
+    ratios = [np.where(ratio.sum(1, keepdims=True) > 0, ratio, 1.0) for ratio in ratios]
     ratios = [ratio / np.maximum(ratio.mean(1, keepdims=True), 1e-300) for ratio in ratios]
     # A common tint of all lights is a tint of the object: the convention is lights that are white on average.
     tint = np.mean(np.concatenate(ratios), axis=0)

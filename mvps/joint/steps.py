@@ -61,7 +61,7 @@ def with_population(vertices: Vertices, anchor: Anchor) -> Anchor:
     mean = (share * vertices.reflectance).sum(0)
     sigma = (share * (vertices.reflectance - mean) ** 2).sum(0).sqrt()
     # An object without this lobe shows no spread either; rounding must not turn that into certainty.
-    sigma = sigma.clamp_min(1e-3 * float(mean[0]))
+    sigma = sigma.clamp_min(1e-3 * float(mean.sum()))
     sigma[0] = torch.inf
     like = vertices.reflectance
     return replace(anchor, reflectance=mean.to(like).expand_as(like), reflectance_sigma=sigma.to(like).expand_as(like))

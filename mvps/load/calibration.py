@@ -4,42 +4,29 @@
     scene.json          optional; "pixel_center": image coordinate c of the first pixel's centre (absent: 0)
 
 An image coordinate of the file plus (0.5 - c) is ours, whose first pixel's centre is at 0.5: so is the principal point.
-MATLAB files are read by scipy, which unpacks only the variables asked for, and only after their shapes were checked.
+Variables are unpacked only after their shapes were checked (matfile.py).
 """
 
 from __future__ import annotations
 
-import json
+import os
 import re
-import struct
-import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import scipy.io
-from scipy.io.matlab import MatReadError
 
-from mvps.load.images import complaint, read_bytes
+from mvps.inputs import parsed_json
+from mvps.load.images import TEXT_LIMIT, complaint, read_bytes
+from mvps.load.matfile import Variable, numbers_of, read_variables
 from mvps.scene import Camera, CaptureError, Float
 
-MAT_ERRORS = (
-    OSError,
-    ValueError,
-    TypeError,
-    KeyError,
-    IndexError,
-    NotImplementedError,
-    OverflowError,
-    MemoryError,
-    EOFError,
-    MatReadError,
-    struct.error,
-    zlib.error,
-)
-"""What scipy raises on damaged MAT files and on HDF5-based ones (version 7.3)."""
+CAMERA_BYTES = 9 * 8
+"""Of the largest of its variables."""
+
+LARGEST = 1e10
+"""Numbers of a calibration are smaller in any unit of length: squares of areas still fit single precision (1e38)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,20 +53,21 @@ def read_calibration(root: Path) -> Calibration:
         raise complaint(root, "a capture's folder", "a file" if root.exists() else "no such folder", "check the path")
     path = root / "Calib_Results.mat"
     read_bytes(path, "the cameras' calibration", "see the capture layout in the README", 1)
-    shapes = _mat_shapes(path)
-    numbers = sorted(int(m[1]) for m in (re.fullmatch(r"Rc_([1-9]\d*)", name) for name in shapes) if m)
+    variables = read_variables(path, CAMERA_BYTES)
+    numbers = sorted(int(m[1]) for m in (re.fullmatch(r"Rc_([1-9]\d{0,5})", name) for name in variables) if m)
     if not numbers:
-        raise complaint(path, "Rc_1, Tc_1 and so on", f"only {sorted(shapes) or 'nothing'}", "export the extrinsics of every view")
-    shared = not any(f"KK_{n}" in shapes for n in numbers)
+        few = sorted(variables)[:8] or "nothing"
+        raise complaint(path, "Rc_1, Tc_1 and so on", f"only {few}", "export the extrinsics of every view")
+    shared = not any(f"KK_{n}" in variables for n in numbers)
     K_names = {n: "KK" if shared else f"KK_{n}" for n in numbers}
     names = {*K_names.values(), *(f"{kind}_{n}" for kind in ("Rc", "Tc") for n in numbers)}
     for name in sorted(names):
         wanted = ((3, 1), (1, 3)) if name.startswith("Tc") else ((3, 3),)
-        if name not in shapes:
-            raise complaint(path, name, f"a file without it (it holds {len(shapes)} variables)", "export the calibration of every view")
-        if tuple(shapes[name]) not in wanted:
-            raise complaint(path, f"{name} of shape {wanted[0]}", f"shape {tuple(shapes[name])}", "export the calibration again")
-    arrays = {name: _numbers(path, name, value) for name, value in read_mat(path, sorted(names)).items()}
+        if name not in variables:
+            raise complaint(path, name, f"a file without it (it holds {len(variables)} variables)", "export the calibration of every view")
+        if variables[name].shape not in wanted:
+            raise complaint(path, f"{name} of shape {wanted[0]}", f"shape {variables[name].shape}", "export the calibration again")
+    arrays = {name: _numbers(path, name, variables[name]) for name in sorted(names)}
     shift = np.eye(3)
     shift[:2, 2] = 0.5 - _pixel_centre(root / "scene.json")
     return Calibration(
@@ -91,43 +79,20 @@ def read_calibration(root: Path) -> Calibration:
     )
 
 
-def _mat_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a MAT file's variables, read without their contents."""
-    try:
-        return {name: shape for name, shape, _ in scipy.io.whosmat(path)}
-    except MAT_ERRORS as error:
-        raise _unreadable_mat(path, error) from None
-
-
-def read_mat(path: Path, names: Sequence[str]) -> dict[str, Any]:
-    """Those variables of a MAT file (no other is unpacked); CaptureError where it is damaged or one is missing."""
-    try:
-        loaded = scipy.io.loadmat(path, variable_names=list(names))
-    except MAT_ERRORS as error:
-        raise _unreadable_mat(path, error) from None
-    for name in names:
-        if name not in loaded:
-            raise complaint(path, f"a variable {name}", f"a file without it ({path.stat().st_size} bytes)", "export it again")
-    return {name: loaded[name] for name in names}
-
-
-def _unreadable_mat(path: Path, error: Exception) -> CaptureError:
-    given = f"one that cannot be read ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
-    return complaint(path, "a MATLAB file", given, "copy it again, or save it in MATLAB with save(..., '-v7')")
-
-
-def _numbers(path: Path, name: str, value: Any) -> Float:
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or not np.isfinite(value).all():
-        raise complaint(path, f"finite real numbers in {name}", f"{np.asarray(value).tolist()}", "export the calibration again")
+def _numbers(path: Path, name: str, variable: Variable) -> Float:
+    value = numbers_of(path, name, variable)
+    if value.dtype.kind not in "fiu" or not (np.abs(value) < LARGEST).all():
+        raise complaint(path, f"finite real numbers in {name}", f"{value.tolist()}", "export the calibration again")
     return value.astype(np.float64)
 
 
 def _pixel_centre(path: Path) -> float:
     """Image coordinate of the first pixel's centre: 0 (Caltech toolbox) unless scene.json says otherwise."""
-    if not path.exists():
+    # A link to nowhere is a file that is missing, not one that was never meant to be there.
+    if not os.path.lexists(path):
         return 0.0
     try:
-        scene = json.loads(read_bytes(path, "a JSON object", "remove the file if it is not needed"))
+        scene = parsed_json(read_bytes(path, "a JSON object", "remove the file if it is not needed", most=TEXT_LIMIT))
     except ValueError as error:
         if isinstance(error, CaptureError):
             raise
@@ -135,6 +100,7 @@ def _pixel_centre(path: Path) -> float:
     if not isinstance(scene, dict):
         raise complaint(path, "a JSON object", type(scene).__name__, "correct or remove the file")
     value = scene.get("pixel_center", 0)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise complaint(path, "a number as pixel_center", repr(value), "use 0, 0.5 or 1: the image coordinate of the first pixel's centre")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:
+        given = repr(value)[:40]
+        raise complaint(path, "a number as pixel_center, from 0 to 1", given, "use the image coordinate of the first pixel's centre")
     return float(value)

@@ -14,15 +14,21 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.inputs import shown
 from mvps.load.calibration import Calibration, read_calibration
-from mvps.load.images import Header, clip_level, complaint, decode, histogram, read_bytes, read_header, read_mask
+from mvps.load.images import TEXT_LIMIT, Header, check_packing, clip_level, complaint, decode, histogram, read_bytes, read_header, read_mask
 from mvps.scene import Bool, Camera, Capture, Int, View
+
+LONGEST_NAME = 255
+"""Bytes of a file's name (NAME_MAX of Linux)."""
 
 
 def read_capture(
@@ -55,11 +61,11 @@ def read_capture(
                 raise complaint(plan.folder, wanted, given, "restore the original size or store one KK_i per view")
     if before_decoding is not None:
         before_decoding([(int(plan.mask.sum()), len(plan.lights)) for plan in plans])
-    samples = _decode_all(plans)
+    samples, frames = _decode_all(plans)
     deep = [s for s, plan in zip(samples, plans, strict=True) if plan.header.bits == 16]
     saturation = {8: 255, 16: clip_level(histogram(deep))}
     return Capture(
-        root.resolve().name,
+        shown(Path(root.resolve().name)),
         tuple(
             View(
                 name=plan.folder.name,
@@ -69,8 +75,10 @@ def read_capture(
                 scale=1 / (2**plan.header.bits - 1),
                 saturation=saturation[plan.header.bits],
                 lights=plan.lights,
+                frame=frame,
+                files=plan.files,
             )
-            for plan, values in zip(plans, samples, strict=True)
+            for plan, values, frame in zip(plans, samples, frames, strict=True)
         ),
     )
 
@@ -157,6 +165,7 @@ def _plan(root: Path, folder: Path, calibration: Calibration, number: int, light
     picked = tuple(files[light - 1] for light in chosen)
     headers = [read_header(file) for file in picked]
     for file, header in zip(picked, headers, strict=True):
+        check_packing(file, header)
         if header[:2] != mask.shape:
             wanted = f"{mask.shape[1]} x {mask.shape[0]} pixels as in mask.png"
             raise complaint(file, wanted, f"{header.width} x {header.height}", "use photographs and a mask of one size")
@@ -170,7 +179,7 @@ def _photographs(root: Path, folder: Path) -> list[Path]:
     """The photographs in the order of their lights: filenames.txt, or 001.png, 002.png and so on without a gap."""
     numbered = sorted((int(p.stem), p.name) for p in folder.iterdir() if re.fullmatch(r"\d+\.png", p.name, re.IGNORECASE))
     listing = folder / "filenames.txt"
-    if listing.exists():
+    if os.path.lexists(listing):
         names = _listed_names(root, listing)
         unlisted = [name for _, name in numbered if name not in names]
         if unlisted:
@@ -189,7 +198,9 @@ def _photographs(root: Path, folder: Path) -> list[Path]:
 def _listed_names(root: Path, listing: Path) -> list[str]:
     """The lines of filenames.txt. It comes from whoever made the capture: it may name no file outside of it."""
     try:
-        text = read_bytes(listing, "names of photographs", "remove the file to use the order of the names").decode("utf-8-sig")
+        text = read_bytes(listing, "names of photographs", "remove the file to use the order of the names", most=TEXT_LIMIT).decode(
+            "utf-8-sig"
+        )
     except UnicodeDecodeError as error:
         raise complaint(listing, "UTF-8 text", f"a byte that is none at position {error.start}", "save it as UTF-8") from None
     lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
@@ -198,30 +209,62 @@ def _listed_names(root: Path, listing: Path) -> list[str]:
     seen: set[str] = set()
     for number, name in lines:
         where = Path(f"{listing}, line {number}")
-        if name in (".", "..") or "/" in name or "\\" in name or "\0" in name or ":" in name:
-            raise complaint(where, "the bare name of a file in this folder", repr(name), "list names without folders")
+        if name in (".", "..") or "/" in name or "\\" in name or "\0" in name or ":" in name or len(os.fsencode(name)) > LONGEST_NAME:
+            raise complaint(where, "the bare name of a file in this folder", repr(name[:80]), "list names without folders")
         if name in seen:
             raise complaint(where, "every name once", f"{name} again", "remove the line")
-        if not (listing.parent / name).resolve().is_relative_to(root.resolve()):
+        # Unlike Path.resolve this ends at a link to itself, which reading refuses.
+        if not Path(os.path.realpath(listing.parent / name)).is_relative_to(root.resolve()):
             raise complaint(where, "a file of this capture", f"{name}, a link that leads out of it", "copy the photograph into the capture")
         seen.add(name)
     return [name for _, name in lines]
 
 
-def _decode_all(plans: Sequence[_Plan]) -> list[NDArray[np.uint16]]:
-    """(pixels, lights, 3) code values of every view, decoded on all cores straight into their place."""
+def _decode_all(plans: Sequence[_Plan]) -> tuple[list[NDArray[np.uint16]], list[NDArray[np.float32]]]:
+    """(pixels, lights, 3) code values and (height, width) mean code value of every view, decoded on all cores straight into their place."""
     samples = [np.empty((int(plan.mask.sum()), len(plan.files), 3), np.uint16) for plan in plans]
     foreground: list[Int] = [np.flatnonzero(plan.mask) for plan in plans]
+    sums, locks = [np.zeros(plan.mask.shape, np.uint32) for plan in plans], [Lock() for _ in plans]
 
     def fill(task: tuple[int, int]) -> None:
         view, light = task
         image = decode(plans[view].files[light], plans[view].header)
         samples[view][:, light] = image.reshape(-1, 3)[foreground[view]]
+        # Integers, the same sum in whatever order photographs come; 32 bits hold 20 000 photographs.
+        with locks[view]:
+            for channel in range(3):
+                sums[view] += image[..., channel]
 
+    _each(fill, [(view, light) for view, plan in enumerate(plans) for light in range(len(plan.files))])
+    return samples, [(total / (3 * len(plan.files))).astype(np.float32) for plan, total in zip(plans, sums, strict=True)]
+
+
+def _each(task: Callable[[Any], None], arguments: Sequence[Any]) -> None:
+    """The task with each argument, on all cores; the first error ends it."""
     pool = ThreadPoolExecutor(len(os.sched_getaffinity(0)))
     try:
-        for _ in pool.map(fill, [(view, light) for view, plan in enumerate(plans) for light in range(len(plan.files))]):
+        for _ in pool.map(task, arguments):
             pass
     finally:
         pool.shutdown(cancel_futures=True)
-    return samples
+
+
+def with_mask(view: View, mask: Bool) -> View:
+    """The view with another mask (height, width). Samples of pixels that were not foreground before are read from the photographs, whose
+    files must be known; a photograph that counts as saturated in all of the old mask is no data in the new pixels either."""
+    kept = mask & view.mask
+    samples = np.empty((int(mask.sum()), len(view.lights), 3), np.uint16)
+    samples[kept[mask]] = view.samples[kept[view.mask]]
+    added = mask & ~view.mask
+    if added.any():
+        new = np.empty((int(added.sum()), len(view.lights), 3), np.uint16)
+
+        def fill(light: int) -> None:
+            file = view.files[light]
+            new[:, light] = decode(file, read_header(file))[added]
+            if not view.usable([light]).any():
+                new[:, light] = np.iinfo(np.uint16).max
+
+        _each(fill, range(len(view.files)))
+        samples[added[mask]] = new
+    return replace(view, mask=mask, samples=samples)

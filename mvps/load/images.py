@@ -7,6 +7,7 @@ data here. The size in the header is checked before memory is asked for.
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.inputs import read_file
 from mvps.scene import Bool, CaptureError, Int
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -26,12 +28,38 @@ PIXEL_LIMIT = 100_000_000
 """Most pixels of an image: no camera used for photometric stereo makes more, and one such image decodes to 0.6 GB."""
 
 
+FILE_LIMIT = 1 << 30
+"""Most bytes of a file that is read whole: PIXEL_LIMIT pixels that do not compress take less."""
+
+TEXT_LIMIT = 1 << 20
+"""Most bytes of a text: names or numbers of ten thousand lights take less."""
+
+UNCHECKED_BYTES = 1 << 26
+"""Decoded bytes that any file may ask for: the decoder holds them twice, for each of two cores."""
+
+MOST_PACKED = 100
+"""Largest ratio of a larger photograph to its file. Noise does not compress: where the object covers a twelfth of the picture and two of
+sixteen bits are noise, the file has a hundredth of the bytes. A thousandth is a picture of nothing, made to fill the memory."""
+
+MASK_LIMIT = 150_000_000
+"""Most decoded bytes of a mask, which may compress a thousandfold: 100 megapixels of 8-bit grey are fewer."""
+
+CHANNELS = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
+"""Decoded, by the colour type of a PNG (ISO/IEC 15948, 11.2.2)."""
+
+
 class Header(NamedTuple):
-    """What a PNG says about itself: height, width in pixels; bits per stored code value, 8 or 16."""
+    """What a PNG says about itself: height, width in pixels; bits per stored code value, 8 or 16; colour type."""
 
     height: int
     width: int
     bits: int
+    colour: int = 2
+
+    @property
+    def decoded(self) -> int:
+        """Bytes of the picture in memory."""
+        return self.height * self.width * CHANNELS.get(self.colour, 4) * self.bits // 8
 
 
 def complaint(path: Path, wanted: str, given: str, advice: str) -> CaptureError:
@@ -39,11 +67,10 @@ def complaint(path: Path, wanted: str, given: str, advice: str) -> CaptureError:
     return CaptureError(f"{path}: wanted {wanted}, given {given}; {advice}")
 
 
-def read_bytes(path: Path, wanted: str, advice: str, limit: int = -1) -> bytes:
-    """The file's first `limit` bytes (-1: all of them), or a CaptureError that says why not."""
+def read_bytes(path: Path, wanted: str, advice: str, first: int = -1, most: int = FILE_LIMIT) -> bytes:
+    """The file's first bytes (-1: all of them, `most` at most), or a CaptureError that says why not."""
     try:
-        with path.open("rb") as file:
-            data = file.read(limit)
+        data = read_file(path, most, first)
     except FileNotFoundError:
         raise complaint(path, wanted, "no such file", advice) from None
     except OSError as error:
@@ -63,7 +90,18 @@ def read_header(path: Path, wanted: str = "a photograph as PNG") -> Header:
     width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
     if width < 1 or height < 1 or width * height > PIXEL_LIMIT:
         raise complaint(path, f"1 to {PIXEL_LIMIT // 1_000_000} megapixels", f"{width} x {height} pixels", "scale or crop the photographs")
-    return Header(height, width, 16 if data[24] == 16 else 8)
+    colour, bits = data[25], data[24]
+    if colour not in CHANNELS or bits not in (1, 2, 4, 8, 16):
+        raise complaint(path, wanted, f"a PNG of colour type {colour} and {bits} bits, which there is not", "export it again")
+    return Header(height, width, 16 if bits == 16 else 8, colour)
+
+
+def check_packing(path: Path, header: Header) -> None:
+    """CaptureError where a photograph would take far more memory than its file can hold a picture for."""
+    size = os.stat(path).st_size
+    if header.decoded > max(UNCHECKED_BYTES, MOST_PACKED * size):
+        given = f"{header.width} x {header.height} pixels in {size} bytes, a {header.decoded // size}th of what they decode to"
+        raise complaint(path, f"a photograph, of which a file holds a {MOST_PACKED}th at least", given, "export or crop it again")
 
 
 def _fault(data: bytes) -> str:
@@ -103,9 +141,17 @@ def decode(path: Path, header: Header) -> NDArray[Any]:
 
 def read_mask(path: Path) -> Bool:
     """(height, width) True where any channel is above half of full scale (127 of 255); never all True or all False."""
-    header = read_header(path, "a mask of the object as PNG, white on black")
+    wanted = "a mask of the object as PNG, white on black"
+    header = read_header(path, wanted)
+    if header.decoded > MASK_LIMIT:
+        raise complaint(
+            path, wanted, f"one that takes {header.decoded / 1e6:.0f} MB, more than {MASK_LIMIT / 1e6:.0f}", "save it as 8-bit grey"
+        )
     values = decode(path, header)
-    mask: Bool = np.asarray((values > (127 if header.bits == 8 else 32767)).any(-1))
+    above, channels = 127 if header.bits == 8 else 32767, 1 if header.colour == 0 else 3
+    mask: Bool = values[..., 0] > above
+    for channel in range(1, channels):
+        mask |= values[..., channel] > above
     if not mask.any():
         raise complaint(path, "some foreground above half of full scale", f"none, largest value {values.max()}", "paint the object white")
     if mask.all():

@@ -10,15 +10,19 @@ x_world = rotation^T DILIGENT_FROM_CAMERA^T x_diligent
 
 from __future__ import annotations
 
+import io
+import os
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import DILIGENT_FROM_CAMERA
-from mvps.load.calibration import Calibration, read_calibration, read_mat
+from mvps.inputs import DAMAGED
+from mvps.load.calibration import LARGEST, Calibration, read_calibration
 from mvps.load.diligent import view_folders
-from mvps.load.images import complaint, read_bytes, read_mask
+from mvps.load.images import TEXT_LIMIT, complaint, read_bytes, read_mask
+from mvps.load.matfile import numbers_of, read_variables
 from mvps.scene import Capture, Float, Lights, Surface, Truth
 
 ONE_RIG_TOLERANCE = 1e-3
@@ -32,16 +36,16 @@ def read_truth(path: str | Path) -> Truth:
     """
     root = Path(path)
     calibration = read_calibration(root)
-    present = [int(f.name[5:]) for f in root.glob("view_*") if f.is_dir() and f.name[5:].isdigit()]
+    present = [int(f.name[5:]) for f in root.glob("view_*") if f.is_dir() and f.name[5:].isdecimal()]
     folders = view_folders(root, calibration, [n for n in present if n in calibration.rotation] or None)
     normals, direction, intensity = {}, {}, {}
     for number, folder in folders.items():
         world_from_diligent = _world_from_diligent(calibration, number)
-        if (folder / "Normal_gt.mat").exists():
+        if os.path.lexists(folder / "Normal_gt.mat"):
             normals[folder.name] = _normals(folder, world_from_diligent)
-        if (folder / "light_directions.txt").exists():
+        if os.path.lexists(folder / "light_directions.txt"):
             direction[folder.name] = _directions(folder) @ world_from_diligent.T
-        if (folder / "light_intensities.txt").exists():
+        if os.path.lexists(folder / "light_intensities.txt"):
             intensity[folder.name] = _table(folder / "light_intensities.txt", positive=True)
     mesh = root / "mesh_Gt.ply"
     return Truth(
@@ -49,7 +53,7 @@ def read_truth(path: str | Path) -> Truth:
         normals=normals,
         direction=direction,
         intensity=intensity,
-        surface=_surface(mesh) if mesh.exists() else None,
+        surface=_surface(mesh) if os.path.lexists(mesh) else None,
     )
 
 
@@ -90,10 +94,14 @@ def _world_from_diligent(calibration: Calibration, number: int) -> Float:
 def _normals(folder: Path, world_from_diligent: Float) -> NDArray[np.float32]:
     path = folder / "Normal_gt.mat"
     mask = read_mask(folder / "mask.png")
-    local = np.asarray(read_mat(path, ["Normal_gt"])["Normal_gt"])
-    if local.shape != (*mask.shape, 3) or local.dtype.kind not in "fiu":
-        wanted = f"Normal_gt of shape {(*mask.shape, 3)} as in mask.png"
-        raise complaint(path, wanted, f"{local.dtype} of shape {local.shape}", "export it again")
+    read_bytes(path, "a MATLAB file", "copy it again", 1)
+    found = read_variables(path, mask.size * 3 * 8, "Normal_gt").get("Normal_gt")
+    if found is None or found.shape != (*mask.shape, 3):
+        given = "a file without it" if found is None else f"{found.kind} of shape {found.shape}"
+        raise complaint(path, f"a variable Normal_gt of shape {(*mask.shape, 3)} as in mask.png", given, "export it again")
+    local = numbers_of(path, "Normal_gt", found)
+    if (np.abs(local) > LARGEST).any():
+        raise complaint(path, "unit normals", "one that is longer than any number in a calibration", "export it again")
     world = local.astype(np.float64) @ world_from_diligent.T
     length = np.linalg.norm(world, axis=-1, keepdims=True)
     world = np.divide(world, length, out=np.full_like(world, np.nan), where=length > 0)
@@ -116,22 +124,26 @@ def _directions(folder: Path) -> Float:
 
 def _table(path: Path, positive: bool) -> Float:
     """(lights, 3) finite numbers."""
-    text = read_bytes(path, "three numbers per light", "provide the file, or leave the calibrated lights out")
+    text = read_bytes(path, "three numbers per light", "provide the file, or leave the calibrated lights out", most=TEXT_LIMIT)
     try:
         table = np.array([[float(word) for word in line.split()] for line in text.decode().splitlines() if line.strip()])
     except ValueError as error:
         raise complaint(path, "three numbers per line", f"text that is none ({error})", "correct the file") from None
-    if table.ndim != 2 or table.shape[1] != 3 or not np.isfinite(table).all() or (positive and (table <= 0).any()):
+    if table.ndim != 2 or table.shape[1] != 3 or not (np.abs(table) < LARGEST).all() or (positive and (table <= 0).any()):
         wanted = "three finite " + ("positive " if positive else "") + "numbers per line"
         raise complaint(path, wanted, f"a table of shape {table.shape}, smallest {table.min(initial=np.inf):.4g}", "correct the file")
     return table
 
 
 def _surface(path: Path) -> Surface:
+    data = read_bytes(path, "a triangle mesh as PLY", "copy or export it again")
     import trimesh
 
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        # Without a folder to look in and without materials no other file is opened.
+        mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False, skip_materials=True)
         return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    except (ValueError, IndexError, KeyError, AttributeError, TypeError, EOFError) as error:
-        raise complaint(path, "a triangle mesh as PLY", f"one that cannot be read ({error})", "copy or export it again") from None
+    except (*DAMAGED, AssertionError) as error:
+        raise complaint(
+            path, "a triangle mesh as PLY", f"one that cannot be read ({str(error)[:200]})", "copy or export it again"
+        ) from None

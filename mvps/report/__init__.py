@@ -1,4 +1,4 @@
-"""Numbers and pictures -> one page that needs nothing else: pictures are inside it, and it runs no program.
+"""Numbers and pictures -> one page that needs nothing else: pictures are inside it, and so is the program that shows the model.
 
 Sections whose numbers the metrics do not hold are left out. The metrics' layout:
 

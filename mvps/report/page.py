@@ -15,6 +15,8 @@ from mvps.rendering import light_sources
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
 from mvps.scene import Capture, Reconstruction, View
+from mvps.viewer import STYLE as VIEWER_STYLE
+from mvps.viewer import viewer_html
 from mvps.visibility import ray_caster
 
 VIEWS_SHOWN = 4
@@ -57,6 +59,8 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
     metrics = reconstruction.metrics
     sections = [
         _heading(reconstruction, capture),
+        _viewer(reconstruction, capture),
+        _findings(metrics.get("findings") or []),
         _pictures(reconstruction, capture),
         _lights(reconstruction, capture),
         _rounds(metrics.get("rounds") or []),
@@ -69,7 +73,9 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{STYLE}</style></head>\n<body>\n" + "\n".join(filter(None, sections)) + "\n</body></html>\n"
+        f"<title>{title}</title><style>{STYLE}{VIEWER_STYLE}</style></head>\n<body>\n"
+        + "\n".join(filter(None, sections))
+        + "\n</body></html>\n"
     )
 
 
@@ -131,6 +137,21 @@ def _heading(reconstruction: Reconstruction, capture: Capture) -> str:
     words = ": ".join(str(status[key]) for key in ("name", "text") if status.get(key))
     outcome = f'<p class="status">{escape(words)}</p>' if words else ""
     return f"<h1>{escape(capture.name)}</h1>\n<p>{escape(' '.join(facts))}</p>\n{outcome}"
+
+
+def _viewer(reconstruction: Reconstruction, capture: Capture) -> str:
+    """The model to turn and to light, as the first known view's camera sees it."""
+    views = _known_views(reconstruction, capture)
+    if not views:
+        return ""
+    rotation = views[0].camera.rotation
+    return _section("Model", viewer_html(reconstruction.surface, reconstruction.material, -rotation[1], -rotation[2]))
+
+
+def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
+    """What was wrong with the capture."""
+    names = {"where": "where", "about": "what", "text": "finding", "mended": "mended"}
+    return _section("Found in the capture", _columns(findings, names)) if findings else ""
 
 
 def _known_views(reconstruction: Reconstruction, capture: Capture) -> list[View]:

@@ -36,6 +36,7 @@ def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Re
     """The light shown ("light 3") and the pictures of a view that the result holds."""
     place = reconstruction.views.index(view.name)
     shared = [k for k, number in enumerate(view.lights) if number in reconstruction.light_names[place]]
+    shared = [k for k in shared if view.shown[k]] or shared
     # The photograph of middling brightness shows both lit and shadowed parts.
     brightness = view.samples[:, shared].mean((0, 2))
     chosen = shared[int(np.argsort(brightness, kind="stable")[len(shared) // 2])]

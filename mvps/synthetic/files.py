@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.mesh import vertex_normals
@@ -66,17 +67,23 @@ def _mesh(surface: Surface) -> bytes:
     return ply_bytes(PlyMesh(surface.vertices, vertex_normals(surface), grey, surface.faces), "ground truth")
 
 
-def _write_view(view: View, truth: Truth, folder: Path) -> None:
+def _png(image: NDArray[Any]) -> bytes:
+    """The image as PNG. cv2.imwrite would do, but for names that are no text, on which it ends the process, and full disks, of which it
+    says nothing."""
     import cv2
 
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _write_view(view: View, truth: Truth, folder: Path) -> None:
     folder.mkdir()
     diligent_from_world = DILIGENT_FROM_CAMERA @ view.camera.rotation
     names = [f"{light:03d}.png" for light in view.lights]
     for k, name in enumerate(names):
         image = np.zeros((*view.mask.shape, 3), np.uint16)
         image[view.mask] = view.samples[:, k, ::-1]
-        cv2.imwrite(str(folder / name), image)
-    cv2.imwrite(str(folder / "mask.png"), view.mask.astype(np.uint8) * 255)
+        (folder / name).write_bytes(_png(image))
+    (folder / "mask.png").write_bytes(_png(view.mask.astype(np.uint8) * 255))
     (folder / "filenames.txt").write_text("\n".join(names) + "\n", encoding="utf-8")
     tables = {
         "light_directions.txt": truth.direction[view.name] @ diligent_from_world.T,

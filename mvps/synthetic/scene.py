@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,9 @@ SUPERSAMPLING = 2
 
 WHITE = 2**16 - 1
 """Largest code value of the 16-bit images; radiance 1."""
+
+Photograph = Callable[..., NDArray[np.float32]]
+"""Takes photographs, with the arguments of `mvps.rendering.photograph`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +93,17 @@ def _supersampled(camera: Camera) -> Camera:
     return Camera(K, camera.rotation, camera.translation, SUPERSAMPLING * camera.height, SUPERSAMPLING * camera.width)
 
 
-def photograph_scene(scene: Scene) -> tuple[tuple[Bool, ...], tuple[NDArray[np.float32], ...], tuple[NDArray[np.float32], ...]]:
-    """What every camera sees, without noise and clipping.
+def photograph_scene(
+    scene: Scene, take: Photograph | None = None
+) -> tuple[tuple[Bool, ...], tuple[NDArray[np.float32], ...], tuple[NDArray[np.float32], ...]]:
+    """What every camera sees, without noise and clipping; `take` replaces `mvps.rendering.photograph`.
 
     Per view: mask (height, width), where the pixel's centre sees the object; radiance (pixels, lights, 3) of the mask's pixels, each
     the mean over its sub-pixels; normals (height, width, 3) at the pixels' centres, world frame, NaN outside the mask.
     """
     from mvps.rendering import photograph
 
+    take = take or photograph
     caster = ray_caster(scene.surface)
     sub = np.stack(np.meshgrid(range(SUPERSAMPLING), range(SUPERSAMPLING), indexing="ij"), -1).reshape(-1, 2)
     masks, radiances, normal_maps = [], [], []
@@ -106,17 +113,18 @@ def photograph_scene(scene: Scene) -> tuple[tuple[Bool, ...], tuple[NDArray[np.f
         normals = normalise(interpolate(scene.surface, hits, scene.material.normal)).astype(np.float32)
         normals[hits.face < 0] = np.nan
         pixels = (SUPERSAMPLING * np.argwhere(mask)[:, None] + sub).reshape(-1, 2)
-        fine = photograph(caster, scene.material, _supersampled(camera), pixels, direction, intensity)
+        fine = take(caster, scene.material, _supersampled(camera), pixels, direction, intensity)
         masks.append(mask)
         radiances.append(fine.reshape(-1, len(sub), *fine.shape[1:]).mean(1))
         normal_maps.append(normals.reshape(camera.height, camera.width, 3))
     return tuple(masks), tuple(radiances), tuple(normal_maps)
 
 
-def render_capture(settings: SceneSettings, scene: Scene | None = None) -> tuple[Capture, Truth]:
-    """The capture and its ground truth. `scene` replaces the one that the settings describe (its cameras and lights too)."""
+def render_capture(settings: SceneSettings, scene: Scene | None = None, take: Photograph | None = None) -> tuple[Capture, Truth]:
+    """The capture and its ground truth. `scene` replaces the one that the settings describe (its cameras and lights too), `take` the
+    renderer (`photograph_scene`)."""
     scene = scene or make_scene(settings)
-    masks, radiances, normal_maps = photograph_scene(scene)
+    masks, radiances, normal_maps = photograph_scene(scene, take)
     white = float(np.quantile(np.concatenate([r.ravel() for r in radiances]), settings.exposure))
     noise_rng = np.random.default_rng((settings.seed, 3))
     views = []

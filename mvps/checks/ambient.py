@@ -1,0 +1,138 @@
+"""Ambient light: an image c_p that every photograph of a view holds besides what its lamp sends,  I_pl = (b_p . s_l)+ + c_p.
+
+Found where no lamp shines. Three factors of the lit samples predict which samples lie in attached shadow, b_p . s_l < 0; there only c and
+what other surfaces send is left. The latter grows with the lamp, the former does not: with F_l a low quantile of I_pl over the pixel's
+bright level among the shadowed samples of light l, and L_l the light's own level,
+
+    F_l = a + k L_l,       a: ambient light, k: inter-reflection.
+
+A low quantile, because the rest of shadows is penumbra, and noise that is cut at black has half of its values there. Ambient light is
+believed where a is more than LEAST and more than twice what k explains, in the median of the views, and the object is no metal, of which
+three factors say nothing.
+
+Taken off: c_p over the bright level as a linear function of b_p / |b_p|, per channel, fitted to the medians of the pixels' shadowed
+samples. Ambient light from everywhere falls on a surface smoothly by its direction; what concavities keep out is not modelled.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.checks.radiometry import is_metal
+from mvps.cores import on_cores
+from mvps.finding import Finding
+from mvps.scene import Bool, Capture, Float, View
+from solvers.low_rank import factorise, solve_rows
+
+FEWEST_LIGHTS = 6
+"""Of a view: factors of fewer leave no shadow to be predicted."""
+
+PIXELS = 600
+"""Looked at in a view."""
+
+SHADOWED = 0.2
+"""Part of a light's level by which a prediction must lie below zero: 12 degrees behind the horizon, more than penumbrae and the factors'
+errors."""
+
+LIT = 0.3
+"""Samples above this part of the bright level make the factors."""
+
+LOW = 0.1
+"""Quantile of the shadowed samples."""
+
+LEAST = 0.01
+"""Of a, in bright levels: lights then are off by a third of a degree (docs/method.md), as much as by all else."""
+
+FEWEST_SHADOWS, FEWEST_OF_LIGHT = 50, 10
+"""Shadowed samples of a view, and of a light, below which they say nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Factors:
+    """Pixels' b over their bright level (n, 3), bright (n, 1) and image (n, lights) in radiance; lights' s (lights, 3) and levels
+    (lights,); shadowed (n, lights)."""
+
+    b: Float
+    bright: Float
+    s: Float
+    level: Float
+    shadowed: Bool
+    image: Float
+
+
+def _factors(view: View, chosen: NDArray[np.int64], s: Float | None = None) -> _Factors:
+    """Of some of a view's pixels; with s the lights are known already."""
+    image = view.samples[chosen].mean(-1, dtype=np.float64) * view.scale
+    bright = np.maximum(np.quantile(image[:, view.shown], 0.8, axis=1, keepdims=True), view.scale)
+    M = image / bright
+    known = (view.samples[chosen] < view.saturation).all(-1) & (M > LIT)
+    if s is None:
+        found = factorise(M, known, 3, floor=1e-3)
+        b, s = found.left, found.right
+    else:
+        b = solve_rows(M, known.astype(np.float64), s)
+    with np.errstate(invalid="ignore"):
+        level = np.array([np.median(M[known[:, k], k]) if known[:, k].any() else np.inf for k in range(M.shape[1])])
+    return _Factors(b, bright, s, level, (b @ s.T < -SHADOWED * level) & view.shown, image)
+
+
+def _line(view: View) -> tuple[float, float]:
+    """a and k times the mean level; NaN where shadows are too few."""
+    chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
+    f = _factors(view, chosen)
+    count = f.shadowed.sum(0)
+    enough = count >= FEWEST_OF_LIGHT
+    if count.sum() < FEWEST_SHADOWS or enough.sum() < 3:
+        return float("nan"), float("nan")
+    M = f.image / f.bright
+    low = np.array([np.quantile(M[f.shadowed[:, k], k], LOW) for k in np.flatnonzero(enough)])
+    level = f.level[enough]
+    weight = np.sqrt(count[enough])
+    columns = np.column_stack([np.ones_like(level), level]) * weight[:, None]
+    a, k = np.linalg.lstsq(columns, low * weight, rcond=None)[0]
+    return float(a), float(k * level.mean())
+
+
+def ambient_share(capture: Capture) -> float:
+    """a of the module's docstring; 0 where it is not to be believed or cannot be told."""
+    enough = [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
+    lines = np.array(on_cores(_line, enough)).reshape(-1, 2)
+    told = np.isfinite(lines[:, 0])
+    if not told.any() or told.mean() < 0.5:
+        return 0.0
+    a, k = np.median(lines[told], axis=0)
+    return float(a) if a > LEAST and a > 2 * abs(k) else 0.0
+
+
+def _taken_off(view: View) -> View:
+    """The view without its ambient image."""
+    some = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
+    f = _factors(view, np.arange(len(view.pixels)), _factors(view, some).s)
+    towards = np.column_stack([np.ones(len(f.b)), f.b / np.maximum(np.linalg.norm(f.b, axis=1, keepdims=True), 1e-12)])
+    values = view.samples.astype(np.float32)
+    dark = np.flatnonzero(f.shadowed.any(1))
+    for channel in range(3):
+        of_channel = values[..., channel]
+        bright = np.maximum(np.quantile(of_channel[:, view.shown], 0.8, axis=1), 1)
+        seen = np.nanmedian(np.where(f.shadowed[dark], of_channel[dark], np.nan), axis=1) / bright[dark]
+        line = np.linalg.lstsq(towards[dark], seen, rcond=None)[0]
+        of_channel -= (np.maximum(towards @ line, 0) * bright)[:, None].astype(np.float32)
+    less = np.rint(np.maximum(values, 0)).astype(np.uint16)
+    # What is no data stays so.
+    return replace(view, samples=np.where(view.usable()[..., None], less, view.samples))
+
+
+def ambient(capture: Capture) -> tuple[Capture, list[Finding]]:
+    """The capture without ambient light, where there is some."""
+    share = ambient_share(capture)
+    if not share or is_metal(capture):
+        return capture, []
+    views = tuple(_taken_off(view) if view.shown.sum() >= FEWEST_LIGHTS else view for view in capture.views)
+    text = (
+        f"where no lamp shines photographs are {100 * share:.1f} % as bright as where it does, whatever the lamp: there was ambient light;"
+        " what every photograph has of it was taken off"
+    )
+    return Capture(capture.name, views), [Finding("radiometry", "all views", text, True)]

@@ -1,0 +1,196 @@
+"""Where the photographs of a view show the object: light, against a background that stays dark under all lights.
+
+With b the mean of a view's photographs over lights and channels (View.frame) and b0 = 1/4096 of full scale (a 12-bit sensor's step: noise
+around black ends near it), log(b + b0) has two heaps where the background is dark: noise and object. They are told apart by Otsu's
+threshold (1979), moved to the emptiest factor of two between the means of the heaps. A view tells object from background where the deep
+half of its mask is lit and what is far from the mask is dark, but for FEW pixels.
+
+A pixel belongs to a mask where its centre sees the object. Pixels that the object covers by less than half, and those that a lens blurs
+its light into, are lit too but much darker than their neighbours nearer to the object: the edge of the object outside a mask is where
+brightness falls by more than half from a pixel to the next, inside a mask it is where light begins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, binary_opening, binary_propagation, label, minimum_filter
+
+from mvps.scene import Bool, View
+
+DARKEST = 1 / 4096
+"""b0, of full scale."""
+
+BINS = 8
+"""Of the histogram to a factor of two."""
+
+FEW = 0.05
+"""Share of the mask's deep half that may be dark (crevices, a hole that the mask fills), and of what is far that may be lit (a limb that
+the mask lacks, a stand)."""
+
+REACH = 10
+"""Pixels from the mask's boundary within which its true edge is looked for."""
+
+SECTORS = 16
+"""Around the mask's centroid, which tell a mask that is off everywhere from one that lacks a limb or has a side in the shadow."""
+
+STEEP = 0.5
+"""Of the brightest neighbour nearer to the mask: what falls off more is no surface but an edge (a pixel half covered, or blurred light)."""
+
+TRUE_EDGES = (-0.12, 0.2)
+"""Pixels outside the boundary at which the object may end for a true mask, which shows 0: half of what masks show that are off by one
+pixel, grown (-0.2 to -0.8: half of their new pixels are covered in part, and lit) or shrunk (0.4 to 0.7: the rim falls off)."""
+
+PARTIAL = 1 / 3
+"""Of its darkest neighbour within the object: a pixel half covered, by 2/3 for what reflection at the rim falls off over a pixel."""
+
+BLOCK = np.ones((3, 3), bool)
+"""Of pixels: no mixed pixels along an edge hold one, so a part that holds one is none of an edge's staircase."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lit:
+    """lit (height, width) where photographs show light; object: without pixels that the object covers by less than half; edges: pixels
+    from the mask's boundary out to the object's edge, (sectors,); judged: whether they tell object from background."""
+
+    lit: Bool
+    object: Bool
+    edges: NDArray[np.float64]
+    judged: bool
+
+    @property
+    def edge(self) -> float:
+        """Median over the sectors."""
+        return float(np.median(self.edges))
+
+    @property
+    def off(self) -> bool:
+        """Whether the mask as a whole is too large or too small: three quarters of the sectors say so, which no shadow makes."""
+        least, most = np.quantile(self.edges, (0.25, 0.75))
+        return bool(self.judged and (least > TRUE_EDGES[1] or most < TRUE_EDGES[0]))
+
+
+def steps(mask: Bool) -> NDArray[np.float32]:
+    """(height, width) signed distance in pixels to the mask's boundary, negative inside, of the staircase of pixels itself."""
+
+    def beside(of: Bool) -> NDArray[np.float32]:
+        # Squares of distances between pixels are whole numbers: rounded to them, they are the same on every call.
+        distance = cv2.distanceTransform(of.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        return np.asarray(np.sqrt(np.rint(distance * distance)), np.float32)
+
+    return np.where(mask, 0.5 - beside(mask), beside(~mask) - 0.5).astype(np.float32)
+
+
+def threshold(frame: NDArray[np.float32], full_scale: float) -> float:
+    """Code value between background and object."""
+    low = np.log2(DARKEST * full_scale)
+    x = np.log2(frame + np.float32(DARKEST * full_scale))
+    count = np.bincount(((x - low) * BINS).astype(np.int64).ravel()).astype(np.float64)
+    if np.count_nonzero(count) < 2:
+        return float(frame.max())
+    centre = low + (np.arange(len(count)) + 0.5) / BINS
+    below, moment = np.cumsum(count), np.cumsum(count * centre)
+    total, mean = below[-1], moment[-1] / below[-1]
+    inner = (below > 0) & (below < total)
+    between = np.zeros(len(count))
+    between[inner] = (mean * below[inner] - moment[inner]) ** 2 / (below[inner] * (total - below[inner]))
+    split = int(between.argmax())
+    dark = moment[split] / below[split]
+    bright = (moment[-1] - moment[split]) / (total - below[split])
+    octave = np.convolve(count, np.ones(BINS))[BINS - 1 :]
+    starts = centre - 0.5 / BINS
+    free = (starts >= dark) & (starts + 1 <= bright)
+    if not free.any():
+        return float(2 ** (starts[split] + 1 / BINS) - 2**low)
+    return float(2 ** (starts[int(np.where(free, octave, np.inf).argmin())] + 0.5) - 2**low)
+
+
+def lit_part(view: View, distance: NDArray[np.float32]) -> Lit | None:
+    """What the photographs of a view show; distance: `steps` of its mask. None where the view's frame is not known."""
+    if view.frame is None:
+        return None
+    lit = view.frame > threshold(view.frame, 1 / view.scale)
+    inner = minimum_filter(lit, 3, mode="nearest")
+    darkest = minimum_filter(np.where(inner, view.frame, np.inf), 3, mode="nearest")
+    half = lit & (inner | np.isinf(darkest) | (view.frame >= PARTIAL * darkest))
+    far = distance > REACH
+    deep = view.mask & (distance <= np.median(distance[view.mask]))
+    judged = bool(lit[deep].mean() >= 1 - FEW and far.any() and lit[far].mean() <= FEW)
+    return Lit(lit, half, _edges(view, view.frame, distance, lit), judged)
+
+
+def _edges(view: View, frame: NDArray[np.float32], distance: NDArray[np.float32], lit: Bool) -> NDArray[np.float64]:
+    """(sectors,) distance from the mask's boundary out to the object's edge; negative where that lies inside."""
+    near = np.abs(distance) < REACH
+    surface = np.where(view.mask, lit, lit & (frame >= STEEP * _nearer(frame, distance)))
+    rows, columns = np.nonzero(near)
+    middle = view.pixels.mean(0)
+    angle = np.arctan2(rows - middle[0], columns - middle[1])
+    sector = ((angle / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64) % SECTORS
+    ring = np.floor(distance[near]).astype(np.int64) + REACH
+    at = sector * 2 * REACH + ring
+    shape, cells = (SECTORS, 2 * REACH), SECTORS * 2 * REACH
+    pixels = np.bincount(at, minlength=cells).reshape(shape)
+    bright = np.bincount(at, surface[near], cells).reshape(shape)
+    # Where a sector has no such pixels (a thin part) nothing speaks against the mask.
+    share = np.where(pixels > 0, bright / np.maximum(pixels, 1), np.arange(2 * REACH) < REACH)
+    outwards, inwards = share[:, REACH:], 1 - share[:, REACH - 1 :: -1]
+    return _run(outwards) - _run(inwards)
+
+
+def _nearer(frame: NDArray[np.float32], distance: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(height, width) the brightest of a pixel's eight neighbours that are nearer to the mask."""
+    height, width = frame.shape
+    values, far = np.pad(frame, 1, mode="edge"), np.pad(distance, 1, constant_values=np.inf)
+    brightest = np.zeros_like(frame)
+    for row in range(3):
+        for column in range(3):
+            part = slice(row, row + height), slice(column, column + width)
+            np.maximum(brightest, np.where(far[part] < distance, values[part], 0), out=brightest)
+    return brightest
+
+
+def _run(share: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum (sectors,) of shares (sectors, rings) from the first ring to the first that is less than half, that one included."""
+    whole = np.cumprod(share >= 0.5, axis=1)
+    counted = np.column_stack([np.ones(len(share)), whole[:, :-1]])
+    total: NDArray[np.float64] = (share * counted).sum(1)
+    return total
+
+
+def moved(view: View, distance: NDArray[np.float32], found: Lit) -> Bool:
+    """The mask with its boundary moved to the edge of the object, no farther than where the median edge lies and a pixel and a half."""
+    reach = abs(found.edge) + 1.5
+    if found.edge > 0:
+        return np.asarray(binary_propagation(view.mask, mask=view.mask | (found.object & (distance < reach))))
+    dark = view.mask & ~found.object & (distance > -reach)
+    return np.asarray(~binary_propagation(~view.mask, mask=~view.mask | dark))
+
+
+def stray_parts(mask: Bool, found: Lit) -> list[Bool]:
+    """Dark parts of a mask that reach its boundary and hold a block."""
+    dark = mask & ~found.lit
+    return [part for part in _parts(dark) if (_grown(part) & ~mask).any()]
+
+
+def missing_parts(mask: Bool, found: Lit) -> list[Bool]:
+    """Lit parts outside a mask that touch it and hold a block."""
+    return [part for part in _parts(found.object & ~mask) if (_grown(part) & mask).any()]
+
+
+def _grown(part: Bool) -> Bool:
+    """The part and the pixels around it."""
+    grown: Bool = binary_dilation(part, BLOCK)
+    return grown
+
+
+def _parts(of: Bool) -> list[Bool]:
+    """Connected parts that hold a block of 3 x 3 pixels."""
+    whole = binary_opening(of, BLOCK)
+    if not whole.any():
+        return []
+    numbers, _ = label(of, BLOCK)
+    return [numbers == number for number in np.unique(numbers[whole])]

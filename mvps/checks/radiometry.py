@@ -1,0 +1,125 @@
+"""A curve that was left in the photographs: found and undone.
+
+Where a pixel is lit, Lambert's law gives photographs of three factors (calibrate.py), I_pl = b_p . s_l. A display's curve,
+I -> I^(1/2.2) and its like, breaks that. So
+
+    rho(curve) = median |M - three factors| / median |M - the pixel's median|,   M = curve^-1(code) over the pixel's bright level,
+
+is least for the curve that was left in. It does not depend on exposure or albedo, and the samples that count, the brightest of each pixel,
+are the same for all curves, which keep their order. A curve is believed where undoing it lowers rho clearly, over all views and in most of
+them: gloss and inter-reflection do not look like one. Of metals, which no three factors explain, none is believed (correlation.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.calibrate import is_metallic
+from mvps.cores import on_cores
+from mvps.finding import Finding
+from mvps.hull import default_cells, signed_distance, visual_hull
+from mvps.scene import Capture, Float, View
+from solvers.low_rank import factorise
+
+Curve = Callable[[Float], Float]
+"""From code values to radiance, both over full scale."""
+
+
+def _srgb(code: Float) -> Float:
+    """IEC 61966-2-1."""
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
+def _power(exponent: float) -> Curve:
+    return lambda code: np.asarray(code, np.float64) ** exponent
+
+
+LINEAR = _power(1.0)
+
+CURVES: Mapping[str, Curve] = MappingProxyType(
+    {"sRGB": _srgb, "gamma 2.2": _power(2.2), "gamma 1.8": _power(1.8), "gamma 2.4": _power(2.4)}
+)
+"""Those of displays and of files for them."""
+
+BETTER = 1.25
+"""Factor of rho: the variance falls by a third. On linear captures undoing a curve makes rho 1.3 to 8 times as large (docs/method.md)."""
+
+FEWEST_LIGHTS = 8
+"""Of a view: six of them lit leave three residuals a pixel."""
+
+LIT_SHARE = 0.9
+"""Of a pixel's samples: the darkest are shadows."""
+
+PIXELS, VIEWS, SWEEPS = 300, 8, 6
+"""Looked at: rho is a median of some thousand samples a view."""
+
+FULL = 65535
+
+
+def _rho(view: View, curve: Curve, pixels: int) -> float:
+    """rho of a view's photographs with a curve undone."""
+    chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:pixels])
+    codes = view.samples[chosen][:, view.shown]
+    image = curve(codes * view.scale).mean(-1)
+    order = np.argsort(np.argsort(codes.sum(-1, dtype=np.int64), axis=1), axis=1)
+    known = (codes < view.saturation).all(-1) & (order >= (1 - LIT_SHARE) * codes.shape[1]) & (codes.min(-1) > 0)
+    bright = np.maximum(np.quantile(image, 0.8, axis=1, keepdims=True), 1e-12)
+    M = image / bright
+    factors = factorise(M, known, 3, SWEEPS, floor=1e-4)
+    if not known.any():
+        return float("nan")
+    left = np.abs(M - factors.left @ factors.right.T)[known]
+    return float(np.median(left) / max(float(np.median(np.abs(M - np.median(M, 1, keepdims=True))[known])), 1e-12))
+
+
+def _log_rho(views: list[View], curve: Curve) -> NDArray[np.float64]:
+    return np.log(np.maximum(on_cores(lambda view: _rho(view, curve, PIXELS), views), 1e-6))
+
+
+def left_in(capture: Capture) -> tuple[str, float] | None:
+    """The name of the curve that was left in all photographs, and by which factor undoing it lowers rho; None where there is none."""
+    enough = [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
+    if not enough:
+        return None
+    some = [enough[i] for i in np.unique(np.linspace(0, len(enough) - 1, VIEWS).round().astype(int))]
+    linear = _log_rho(some, LINEAR)
+    # The curves are alike: where one of them is no better than none, neither is another.
+    if not np.nanmean(linear - _log_rho(some, CURVES["gamma 2.2"])) > 0:
+        return None
+    better = {name: linear - _log_rho(some, curve) for name, curve in CURVES.items()}
+    name = max(better, key=lambda name: float(np.nanmean(better[name])))
+    gain = float(np.nanmean(better[name]))
+    if gain < np.log(BETTER) or np.nanmedian(better[name] > 0) < 1:
+        return None
+    return name, float(np.exp(gain))
+
+
+def linear(view: View, curve: Curve) -> View:
+    """The view with a curve undone, its samples of 16 bits whatever they were: eight would lose the dark ones."""
+    codes = np.arange(FULL + 1)
+    table = np.rint(FULL * curve(np.minimum(codes * view.scale, 1.0))).astype(np.uint16)
+    return replace(view, samples=table[view.samples], scale=1 / FULL, saturation=int(table[view.saturation]))
+
+
+def is_metal(capture: Capture) -> bool:
+    """Whether the object is one, by its hull; False for a single view, which has none."""
+    if len(capture.views) < 2:
+        return False
+    return is_metallic(capture, visual_hull(signed_distance(capture, default_cells(capture))), 0)
+
+
+def curve_undone(capture: Capture) -> tuple[Capture, list[Finding]]:
+    """The capture with linear samples, where a curve was left in all of its photographs."""
+    found = left_in(capture)
+    # Sharper highlights look like a metal's to three factors, so of metals nothing is believed.
+    if found is None or is_metal(capture):
+        return capture, []
+    name, factor = found
+    views = tuple(linear(view, CURVES[name]) for view in capture.views)
+    text = f"the photographs are not linear: three factors fit {factor:.1f} times as well without the curve {name}; undone"
+    return Capture(capture.name, views), [Finding("radiometry", "all views", text, True)]

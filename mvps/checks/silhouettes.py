@@ -1,0 +1,173 @@
+"""Masks that do not fit their photographs, and views that do not fit the others.
+
+In this order, each mended before the next is looked at:
+
+mask    grown or shrunk as a whole: the edge of what the photographs show lit is not where the mask ends (lit.py)
+part    dark under all lights, at the mask's rim, and outside the hull of the other views or apart from the rest: taken out; lit, outside
+        the mask or in a hole of it, and inside the hull of the other views: given back. A hole that shows the background stays
+view    silhouettes that disagree (cones.py): where all others agree without a view, and without no other, that view's pose is not that of
+        its photographs, and it is left out; so are two views of one pose and two silhouettes where nothing says which is wrong
+
+Photographs speak of masks only where they tell object from background; silhouettes speak of views always.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import binary_opening, binary_propagation
+
+from mvps.checks.cones import ENOUGH, Cones, wrong_at_most
+from mvps.checks.lit import BLOCK, Lit, lit_part, missing_parts, moved, steps, stray_parts
+from mvps.cores import on_cores
+from mvps.finding import Finding
+from mvps.load import with_mask
+from mvps.scene import Bool, Capture, View
+
+FEWEST = 3
+"""Views that can contradict one another: of two, either may be wrong."""
+
+
+def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
+    """The capture with masks mended and wrong views left out, and what was found."""
+    mended, of_masks = _moved(capture)
+    mended, of_parts = _parted(mended)
+    left, of_views = _left_out(mended)
+    return left, [*of_masks, *of_parts, *of_views]
+
+
+def _seen(view: View) -> tuple[Lit | None, Bool | None]:
+    """What the photographs show, and the mask moved to it where it is off as a whole."""
+    distance = steps(view.mask)
+    found = lit_part(view, distance)
+    return found, moved(view, distance, found) if found is not None and found.off and view.files else None
+
+
+def _moved(capture: Capture) -> tuple[Capture, list[Finding]]:
+    """Masks that are off as a whole, with their boundary where the object ends."""
+    seen = on_cores(_seen, capture.views)
+    views, edges = list(capture.views), {}
+    for at, (found, mask) in enumerate(seen):
+        if found is not None and mask is not None and mask.any():
+            views[at] = with_mask(views[at], mask)
+            edges[views[at].name] = found.edge
+    if not edges:
+        return capture, []
+    where = "all views" if len(edges) == len(views) else ", ".join(edges)
+    middle = float(np.median(list(edges.values())))
+    way = "larger" if middle < 0 else "smaller"
+    text = (
+        f"{'masks are' if len(edges) > 1 else 'the mask is'} {way} than the object: in the photographs it ends"
+        f" {abs(middle):.1f} pixels {'inside' if middle < 0 else 'outside'} the boundary (median), more than the pixels' staircase"
+        " explains; moved to where it ends"
+    )
+    return Capture(capture.name, tuple(views)), [Finding("mask", where, text, True)]
+
+
+def _parted(capture: Capture) -> tuple[Capture, list[Finding]]:
+    """Masks without what is none of the object and with what they lack of it."""
+    if len(capture.views) < FEWEST:
+        return capture, []
+
+    def parts_of(view: View) -> tuple[list[Bool], list[Bool]]:
+        found = lit_part(view, steps(view.mask))
+        if found is None or not found.judged or not view.files:
+            return [], []
+        return stray_parts(view.mask, found), missing_parts(view.mask, found)
+
+    parts = on_cores(parts_of, capture.views)
+    if not any(stray or missing for stray, missing in parts):
+        return capture, []
+    cones, views = Cones(capture), list(capture.views)
+    gone, back = dict[str, int](), dict[str, int]()
+    for at, (stray, missing) in enumerate(parts):
+        view = views[at]
+        out = _sum([part for part in stray if _needless(cones, at, part)], view.mask)
+        added = _sum([part for part in missing if _wanted(cones, at, part)], view.mask)
+        gone |= {view.name: int(out.sum())} if out.any() else {}
+        back |= {view.name: int(added.sum())} if added.any() else {}
+        if out.any() or added.any():
+            views[at] = with_mask(view, (view.mask | added) & ~out)
+    if not gone and not back:
+        return capture, []
+    said = (
+        (gone, "{} pixels of the mask are dark in all photographs and outside the other views' silhouettes: taken out"),
+        (back, "the mask lacks {} pixels that are lit in the photographs and inside the other views' silhouettes: given back"),
+    )
+    findings = [Finding("mask", ", ".join(of), text.format(sum(of.values())), True) for of, text in said if of]
+    return Capture(capture.name, tuple(views)), findings
+
+
+def _sum(parts: Sequence[Bool], like: Bool) -> Bool:
+    """All parts in one picture."""
+    return np.asarray(np.logical_or.reduce([np.zeros_like(like), *parts]))
+
+
+def _wanted(cones: Cones, view: int, part: Bool) -> bool:
+    """Whether the hull of the other views, but for those that may be wrong, covers most of a part."""
+    everyone = range(len(cones.capture.views))
+    covered = cones.covered(view, everyone, dissent=wrong_at_most(len(everyone)) - 1)
+    return bool(covered[part].mean() > 0.5)
+
+
+def _needless(cones: Cones, view: int, part: Bool) -> bool:
+    """Whether a dark part of a mask is none of the object: the others' hull leaves most of it out, or more than
+    errors of poses can, or it hangs together with nothing lit. Elsewhere darkness may be the object's own shadow."""
+    outside = ~cones.covered(view, range(len(cones.capture.views)))[part]
+    if outside.mean() >= 0.5 or outside.sum() > ENOUGH:
+        return True
+    mask = cones.capture.views[view].mask
+    return bool((binary_propagation(part, BLOCK, mask) == part).all())
+
+
+def _left_out(capture: Capture) -> tuple[Capture, list[Finding]]:
+    """The capture without views whose silhouettes contradict the others'."""
+    if len(capture.views) <= FEWEST:
+        return capture, []
+    cones, among = Cones(capture), list(range(len(capture.views)))
+    names, most = [view.name for view in capture.views], wrong_at_most(len(capture.views))
+    counts = at_first = cones.uncovered(among)
+    findings: list[Finding] = []
+    while max(counts) > ENOUGH and len(findings) < most and len(among) > FEWEST:
+        left = [cones.uncovered([j for j in among if j != k]) for k in among]
+        order = np.argsort([sum(one) for one in left])
+        best, second = order[0], order[1]
+        # Where without either of two views the others agree as well, nothing says which of them is wrong.
+        if sum(left[second]) <= sum(left[best]) + ENOUGH:
+            break
+        text = (
+            f"its silhouette contradicts the others' ({sum(counts)} pixels of the masks outside the other views' hull with it,"
+            f" {sum(left[best])} without): its pose is not that of its photographs; left out"
+        )
+        findings.append(Finding("pose", names[among.pop(best)], text, True))
+        counts = left[best]
+    for pair in _twins([capture.views[at] for at in among]):
+        both = [names.index(view.name) for view in pair]
+        out = len(findings) + len(both) <= most
+        among = [at for at in among if at not in both] if out else among
+        for view, other in (pair, pair[::-1]):
+            done = "both left out" if out else "correct it, or leave it out"
+            text = f"it has the pose of {other.name} and another silhouette: one of the two is wrong; {done}"
+            findings.append(Finding("pose", view.name, text, out))
+        counts = cones.uncovered(among)
+    if max(counts) > ENOUGH:
+        text = (
+            f"silhouettes disagree: {sum(at_first)} pixels of the masks are outside the other views' hull, most in"
+            f" {names[int(np.argmax(at_first))]}, and no view alone explains it; check poses and masks"
+        )
+        return capture, [Finding("pose", "all views", text, False)]
+    return (Capture(capture.name, tuple(capture.views[at] for at in among)) if len(among) < len(names) else capture), findings
+
+
+def _twins(views: Sequence[View]) -> list[tuple[View, View]]:
+    """Pairs of views whose cameras are the same to a pixel and whose masks differ by more than their outlines' staircase."""
+    pairs = []
+    for at, one in enumerate(views):
+        for other in views[at + 1 :]:
+            a, b = one.camera, other.camera
+            depth = float(np.linalg.norm(a.translation))
+            moved = max(np.abs(a.translation - b.translation).max(), depth * np.abs(a.rotation - b.rotation).max()) * a.focal_length / depth
+            if moved < 1 and one.mask.shape == other.mask.shape and binary_opening(one.mask ^ other.mask, BLOCK).sum() > ENOUGH:
+                pairs.append((one, other))
+    return pairs

@@ -1,0 +1,82 @@
+"""Stage II of one view: lights, reflectance and the normals of pixels in turn with the surface that these normals integrate to.
+
+A round:  bas-relief (bas_relief.py) -> normals integrated -> the photometric part of a round on that mesh (photometry.py), whose patches
+keep the mesh's mean slopes. There is no second view to move vertices by.
+
+The law has all lobes from the start and no more: what resolves the bas-relief cannot be on trial under lights that are off by a bas-relief
+(on trial, spot's and two made captures' lobes were refused, and their normals ended at 7 to 8 degrees in place of 3 to 4), and the diffuse
+term's change at grazing angles turns all normals together as a bas-relief does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from mvps.joint.bas_relief import bas_relief, turned
+from mvps.joint.photometry import State, Task, photometric_round
+from mvps.joint.refine import Refined, RefineSettings, finished
+from mvps.mesh import lengths
+from mvps.scene import Capture, Float, Law, Lights, NormalMap, Surface
+
+ROUNDS = {"draft": 1, "standard": 3, "fine": 5}
+"""By preset."""
+
+
+def _without_relief(
+    capture: Capture, lights: Lights, maps: NormalMap, law: Law, generator: np.random.Generator, device: torch.device
+) -> tuple[Lights, NormalMap]:
+    """Lights and normals after the bas-relief that fits the photographs best."""
+    direction, intensity = lights.direction[0], lights.intensity[0]
+    grey = maps.albedo.mean(1).astype(np.float64)
+    normal = maps.normal.astype(np.float64)
+    G = bas_relief(capture.views[0], normal, grey, (direction, intensity), law, generator, device)
+    moved, albedo, turned_direction, strength = turned(G, normal, grey, direction, intensity.mean(1))
+    colour = intensity / intensity.mean(1, keepdims=True)
+    share = np.where(grey > 0, albedo / np.maximum(grey, 1e-300), 1.0)
+    solved = np.where(maps.confidence[:, None] > 0, moved, normal).astype(np.float32)
+    solved /= lengths(solved)[:, None]
+    return Lights((turned_direction,), (strength[:, None] * colour,), lights.one_rig), NormalMap(
+        solved, (maps.albedo * share[:, None]).astype(np.float32), maps.confidence
+    )
+
+
+def refine_view(
+    capture: Capture,
+    lights: Lights,
+    maps: NormalMap,
+    law: Law,
+    settings: RefineSettings,
+    rounds: int,
+    seed: int,
+    device: torch.device,
+    integrated: Callable[[Float, Float], Surface],
+    on_round: Callable[[int, dict[str, float]], None],
+) -> Refined:
+    """Rounds from lights and photometric stereo of the capture's only view. integrated: the surface of normals (pixels, 3), world, with
+    confidence (pixels,). settings: whose rounds are not used, one view has its own kind."""
+    model = replace(settings.model, sharpness=law.sharpness, grazing=False, bounce=False)
+    generator = np.random.default_rng(seed)
+    torch.set_num_threads(1)
+    state: State | None = None
+    account: list[dict[str, float]] = []
+    carried = None
+    for number in range(1, rounds + 1):
+        if settings.free_lights:
+            lights, maps = _without_relief(capture, lights, maps, law if state is None else state.law, generator, device)
+        surface = integrated(maps.normal, maps.confidence)
+        if state is None:
+            state = State(surface, lights, (maps,), law, model)
+        state.surface, state.lights, state.maps, state.coarse = surface, lights, (maps,), None
+        task = Task(settings.free_lights, False, False, False, False, device)
+        changes = photometric_round(state, capture, task, carried, generator)
+        assert state.vertices is not None
+        carried = (surface, state.vertices)
+        lights, maps = state.lights, state.maps[0]
+        account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, "vertex_change_px": 0.0})
+        on_round(number, account[-1])
+    assert state is not None
+    return finished(state, settings, account, device, generator)

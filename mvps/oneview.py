@@ -1,0 +1,183 @@
+"""One view: photometric stereo whose surface comes from its normals alone.
+
+factorisation -> 3 x 3 ambiguity (relief/ambiguity.py) -> photometric stereo -> rounds of bas-relief, integration and Stage II
+(joint/one_view.py) -> the same result as of many views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mvps.finding import Finding
+from mvps.progress import Progress
+from mvps.scene import Capture, CaptureError, Float, Lights, NormalMap, Reconstruction, Surface, View
+
+if TYPE_CHECKING:
+    from mvps.device import Device
+    from mvps.plan import Parts
+    from mvps.reconstruct import Settings
+
+WORDS = (
+    "One view: the surface is what its normals integrate to, open, of what this camera sees; its distance {distance} and heights of steps"
+    " are not known from photographs under distant lights."
+)
+OF_ORIGIN = "is the world origin's"
+FEWEST_LIGHTS = 12
+"""From which on trimmed photographs leave enough for normals: nine."""
+
+KEPT, CONCENTRATIONS = 0.75, 10
+"""Part of the photographs that is believed in the search for wrong ones, as is usual for least trimmed squares; its steps, of which two or
+three are needed."""
+
+OUTLYING = 3.0
+"""Times what photographs leave in the median: highlights alone make 2.4 (ball, bunny), photographs that are wrong 5 and more (bear)."""
+
+LIT, FEWEST_PIXELS = 0.3, 30
+"""Cosine from which a pixel is well lit; pixels that must be."""
+
+OF_UNIT = "is such that a pixel covers one unit of length (the world's origin is not in the picture): its size is not known either,"
+
+
+def distance_of(view: View) -> tuple[float, str]:
+    """Depth of the surface along the camera's axis, world units, and where it is from, in words: the world origin's, where it lies
+    in front of the camera inside the mask's bounding box; else the focal length."""
+    from mvps.camera import project
+
+    depth = float(view.camera.translation[2])
+    if depth > 0:
+        image = project(view.camera, np.zeros(3))[0]
+        low, high = view.pixels.min(0)[::-1], view.pixels.max(0)[::-1] + 1
+        if ((image >= low) & (image <= high)).all():
+            return depth, OF_ORIGIN
+    return view.camera.focal_length, OF_UNIT
+
+
+def surface_of(view: View, normal: Float, confidence: Float, distance: float) -> Surface:
+    """The open mesh that normals (pixels, 3), world frame, with confidence (pixels,) integrate to."""
+    from mvps.relief.integrate import integrate
+    from mvps.relief.surface import pixel_surface
+
+    local = np.asarray(normal, np.float64) @ view.camera.rotation.T
+    depth = integrate(view.camera, view.mask, local, np.asarray(confidence, np.float64))
+    return pixel_surface(view.camera, view.pixels, local, depth, distance)
+
+
+def lights_of_view(capture: Capture, given: Lights | None, seed: int, progress: Progress) -> Lights:
+    """The given lights, or those of the factorisation with its ambiguity resolved up to what lobes say later."""
+    from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, normalised, solve_ambiguity
+    from mvps.relief.ambiguity import factors, resolved
+    from mvps.relief.silhouette import inflated_normals
+
+    view = capture.views[0]
+    with progress.stage("lights") as stage:
+        if given is not None:
+            stage.status("given with the capture")
+            return given
+        if len(view.lights) < MINIMUM_LIGHTS:
+            raise CaptureError(
+                f"{capture.name}: wanted at least {MINIMUM_LIGHTS} photographs of the one view to solve its lights, given"
+                f" {len(view.lights)}; add photographs, views or --calibrated-lights"
+            )
+        generator = np.random.default_rng(seed)
+        pseudo = factors(view, generator)
+        rough = inflated_normals(view.mask)
+        try:
+            A = resolved(view, pseudo, rough, solve_ambiguity(pseudo.left, rough, pseudo.weight), generator)
+        except np.linalg.LinAlgError as error:
+            raise CaptureError(
+                f"{capture.name}: wanted photographs whose lights span three directions, given ones where {error};"
+                " use other lights or --calibrated-lights"
+            ) from error
+        scaled = pseudo.right @ np.linalg.inv(A)
+        strength = np.linalg.norm(scaled, axis=1, keepdims=True)
+        stage.status(f"one view; three factors leave {100 * pseudo.residual:.1f} % of the images")
+        return normalised([scaled / strength @ view.camera.rotation], [strength * colour_ratios(view)], True)
+
+
+def residuals(view: View, maps: NormalMap, lights: Lights) -> Float:
+    """(lights,) of each photograph the median residual of Lambert's law over its median value, at its well lit pixels; NaN where these are
+    too few."""
+    cosine = maps.normal.astype(np.float64) @ lights.direction[0].T
+    predicted = maps.albedo.mean(1)[:, None] * cosine * lights.intensity[0].mean(1)
+    image = view.samples.mean(-1) * view.scale
+    lit = view.usable() & (cosine > LIT) & (maps.confidence > 0)[:, None]
+    enough = [np.flatnonzero(lit[:, k]) if lit[:, k].sum() >= FEWEST_PIXELS else None for k in range(lit.shape[1])]
+    found = [
+        np.nan if rows is None else np.median(np.abs(image[rows, k] - predicted[rows, k])) / max(np.median(image[rows, k]), 1e-12)
+        for k, rows in enumerate(enough)
+    ]
+    return np.array(found)
+
+
+def without_misfits(capture: Capture, lights: Lights, device: Device) -> tuple[Capture, list[Finding]]:
+    """The capture without photographs that fit no surface under the given lights: they, or their lights, are wrong.
+
+    Least trimmed squares: normals from the KEPT part of the photographs that fits best, all photographs ranked anew by what these normals
+    leave of them, until the part stays the same (Rousseeuw and Van Driessen 2006). Then those are left out that leave more than POOR_FIT
+    and OUTLYING times what is usual.
+    """
+    from mvps.material import POOR_FIT
+    from mvps.photometric import normal_maps
+
+    view = capture.views[0]
+    if len(view.lights) < FEWEST_LIGHTS:
+        return capture, []
+    dropped: list[int] = []
+    found: Float = np.zeros(len(view.lights))
+    for _ in range(CONCENTRATIONS):
+        found = residuals(view, normal_maps(capture.without({view.name: dropped}), lights, device)[0], lights)
+        order = np.argsort(np.nan_to_num(found, nan=np.inf), kind="stable")
+        worst = sorted(view.lights[k] for k in order[int(np.ceil(KEPT * len(order))) :])
+        if worst == dropped:
+            break
+        dropped = worst
+    with np.errstate(invalid="ignore"):
+        wrong = [n for n, r in zip(view.lights, found, strict=True) if r > max(POOR_FIT, OUTLYING * float(np.nanmedian(found)))]
+    words = "fits no surface under its light as the others do; left out"
+    return capture.without({view.name: wrong}), [Finding("photograph", f"{view.name}/{n:03d}", words, True) for n in wrong]
+
+
+def reconstruct_view(
+    capture: Capture,
+    used: Capture,
+    held: Capture | None,
+    settings: Settings,
+    given: Lights | None,
+    parts: Parts,
+    progress: Progress,
+    findings: Sequence[Finding],
+) -> Reconstruction:
+    """A reconstruction from the only view of `used`; the rest as in reconstruct.reconstruct."""
+    from mvps.device import chosen_device
+    from mvps.joint.one_view import ROUNDS, refine_view
+    from mvps.joint.refine import RefineSettings
+    from mvps.outcome import all_lights, normal_pictures, told
+    from mvps.photometric import normal_maps
+
+    device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
+    distance, words = distance_of(view)
+    lights = lights_of_view(used, given, settings.seed, progress)
+    with progress.stage("photometric stereo") as stage:
+        used, misfits = without_misfits(used, lights, device)
+        maps = normal_maps(used, lights, device)[0]
+        stage.status(f"{len(misfits)} photographs left out" if misfits else "")
+    plan = parts.of(RefineSettings((), free_lights=given is None, final=True))
+    with progress.stage("joint refinement", total=rounds) as stage:
+
+        def on_round(_: int, changes: dict[str, float]) -> None:
+            stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg")})
+
+        def integrated(normal: Float, confidence: Float) -> Surface:
+            return surface_of(view, normal, confidence, distance)
+
+        refined = refine_view(used, lights, maps, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
+        stage.status(refined.status)
+    with progress.stage("lights and normals of all views"):
+        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
+        pictures = normal_pictures(capture, used, refined)
+    said = WORDS.format(distance=words)
+    return told(capture, used, asdict(settings), refined, complete, pictures, refined.rounds, progress, [*findings, *misfits], said)

@@ -1,0 +1,138 @@
+"""From what Stage II ends with to a result: lights of all photographs, normals of all views, the verdict, the account."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from mvps import __version__
+from mvps.finding import Finding
+from mvps.progress import Progress
+from mvps.scene import Capture, Lights, Reconstruction
+
+if TYPE_CHECKING:
+    from mvps.device import Device
+    from mvps.joint.refine import Refined
+    from mvps.scene import Material, Surface
+
+
+def all_lights(
+    capture: Capture, used: Capture, held: Capture | None, lights: Lights, surface: Surface, material: Material, device: Device
+) -> Lights:
+    """Lights of every photograph of `capture`, in its order: `lights` where used, else carried over from the rig or fitted."""
+    import numpy as np
+
+    from mvps.joint.held_out import carried_over, fit_lights
+
+    known: dict[tuple[str, int], tuple[Any, Any]] = {}
+    for view, directions, intensities in zip(used.views, lights.direction, lights.intensity, strict=True):
+        known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
+    if held is not None and lights.one_rig:
+        rotations = [view.camera.rotation for view in used.views]
+        for view in held.views:
+            directions, intensities = carried_over(lights, rotations, view.camera.rotation)
+            rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
+            known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
+    if held is not None:
+        unknown = {view.name: [n for n in view.lights if (view.name, n) not in known] for view in held.views}
+        rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
+        if rest is not None:
+            shared = lights.one_rig and len({view.lights for view in rest.views}) == 1
+            fitted = fit_lights(rest, surface, material, shared, device)
+            for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
+                known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
+    direction = tuple(np.array([known[view.name, n][0] for n in view.lights]) for view in capture.views)
+    intensity = tuple(np.array([known[view.name, n][1] for n in view.lights]) for view in capture.views)
+    return Lights(direction, intensity, lights.one_rig)
+
+
+def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[Any, ...]:
+    """Refined normals (height, width, 3) of every view, NaN outside the mask.
+
+    Views that were used show their own pixels' normals, as far as they were solved (`filled`); held-out ones the vertices' normals. A pixel
+    that misses the mesh takes its nearest neighbour's.
+    """
+    import numpy as np
+    from scipy.ndimage import distance_transform_edt
+
+    from mvps.joint.pixels import filled
+    from mvps.rendering import points_under
+    from mvps.visibility import ray_caster
+
+    caster = ray_caster(refined.surface)
+    own = {view.name: maps for view, maps in zip(used.views, refined.maps, strict=True)}
+    pictures = []
+    for view in capture.views:
+        points = points_under(caster, refined.material, view.camera, view.pixels)
+        normal = filled(view, own[view.name], points.normal) if view.name in own else points.normal
+        picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
+        picture[view.mask] = np.where(points.hit[:, None], normal, np.nan)
+        if points.hit.any():
+            nearest = distance_transform_edt(np.isnan(picture[..., 0]), return_distances=False, return_indices=True)
+            picture = picture[tuple(nearest)]
+        picture[~view.mask] = np.nan
+        pictures.append(picture)
+    return tuple(pictures)
+
+
+def versions() -> dict[str, str]:
+    """Versions of the program and of the libraries that its figures depend on."""
+    import platform
+    from importlib.metadata import version
+
+    names = ("torch", "numpy", "scipy", "libigl", "embreex", "scikit-image", "gpytoolbox", "opencv-python-headless")
+    return {"mvps": __version__, "python": platform.python_version(), **{name: version(name) for name in names}}
+
+
+def told(
+    capture: Capture,
+    used: Capture,
+    settings: Mapping[str, Any],
+    refined: Refined,
+    complete: Lights,
+    pictures: tuple[Any, ...],
+    rounds: list[dict[str, float]],
+    progress: Progress,
+    findings: Sequence[Finding],
+    words: str = "",
+) -> Reconstruction:
+    """The result with the account of how it came about, and whether it is to be trusted.
+
+    used: what it was made from; settings: plain values; complete, pictures: lights and normals of all views; findings: of the capture's
+    checks; words: to end the verdict with.
+    """
+    from mvps.nearness import nearness
+    from mvps.verdict import signs, verdict
+
+    with progress.stage("verdict") as stage:
+        of_used = [picture for view, picture in zip(capture.views, pictures, strict=True) if view.name in {v.name for v in used.views}]
+        found = signs(used, refined.surface, refined.material, of_used, refined.rounds[-1]["residual"])
+        status, text = verdict(found, (refined.status, refined.text), findings)
+        # Normals of one view may be right, and heights wrong all the same.
+        status = "one view" if words and status == "converged" else status
+        near = nearness(used, refined.surface, refined.material, refined.lights)
+        if near.near:
+            said = "brightness falls off across the object as it does under near lights, which are taken for directional ones: normals lean"
+            findings = [*findings, Finding("lights", "all views", f"{said} ({near.slope:.3f}, far lights 0)", False)]
+            text = f"{text} But {said}."
+        stage.status(status)
+    metrics = {"stages": progress.stages, "rounds": rounds, "status": {"name": status, "text": f"{text} {words}".strip(), **found}}
+    metrics["findings"] = [asdict(one) for one in findings]
+    metrics["model"] = {
+        "components": [asdict(trial) for trial in refined.trials],
+        "sharpness": list(refined.law.sharpness),
+        "grazing": refined.law.grazing,
+        "bounce": refined.law.bounce,
+        "share_with_neural_residual": 0.0 if refined.material.residual is None else float(refined.material.residual.share.mean()),
+    }
+    return Reconstruction(
+        refined.surface,
+        refined.material,
+        complete,
+        tuple(view.name for view in capture.views),
+        tuple(view.lights for view in capture.views),
+        pictures,
+        metrics,
+        {**settings, "versions": versions()},
+    )

@@ -1,0 +1,164 @@
+"""Lights of one view without calibration, up to what integrability, the outline and a few albedos tell.
+
+A robust rank-3 factorisation (solvers/low_rank.py) gives b' and s' with I_pl = b'_p . s'_l, and b = A b', s = A^-T s' for an unknown A
+(3, 3). Three things are known of b = albedo * normal, each robustly, and A minimises their sum:
+
+integrability   b is a surface's: with h = (b_x, b_y, b . r), r = (x, y, 1) the pixel's ray, the slopes (h_x / h_z, h_y / h_z) have no
+                curl, (h x d_x h)_x + (h x d_y h)_y = 0, where h x dh turns with the cofactors of A (Yuille and Snow 1997; perspective:
+                Papadhimitri and Favaro 2013). Divided by |b'|^2 with the first two rows of the cofactors of unit size: so no collapse
+                of A lowers it. It leaves the generalised bas-relief (Belhumeur et al. 1999): three unknowns.
+albedo          few different ones: Renyi's quadratic entropy of log |b|, - sum_pq exp(-(log |b_p| / |b_q|)^2 / 2 h^2) over pairs of
+                pixels of one colour (Alldrin et al. 2007 minimise Shannon's), h shrinking from LOOSE to TIGHT.
+outline         normals in the mask's outer band are nearly those of its inflated silhouette: Geman and McClure's function. The
+                outline tells convex from concave, which nothing else here does.
+
+The start is the A that maps b' to the inflated silhouette's normals (as calibrate.py does with a hull's).
+What lobes say of the bas-relief comes after (joint/bas_relief.py).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from mvps.camera import pixel_centres
+from mvps.mesh import normalise
+from mvps.scene import Float, Int, View
+from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, robust_weights, solve_rows
+
+PAIRS, BLOCKS, BAND, FACTORED = 4000, 3000, 1000, 4000
+"""Pairs of pixels, blocks of 2 x 2 pixels and outline pixels that are drawn, and pixels that are factorised: nine unknowns against
+thousands of equations leave the error to the model."""
+
+LOOSE, TIGHT = 0.4, 0.1
+"""h of the albedos' logarithms: from the error of a first guess to the shades of one paint."""
+
+ROUGH = 0.2
+"""Scale, radians, of the outline's normals: a pixel from the edge of a ball of 50 pixels the normal has turned by as much."""
+
+SHARE_OF_OUTLINE = 0.1
+"""Weight of the outline beside the other two: it is a guess, and only has to keep convex from concave."""
+
+ONE_COLOUR = 0.05
+"""Difference of log chroma at which two pixels no longer count as of one colour."""
+
+SWEEPS = 5
+SHADOWED, BRIGHT_QUANTILE = 0.1, 0.8
+"""As in calibrate.py."""
+
+
+@dataclass(frozen=True)
+class Pseudo:
+    """The factors of one view: left (pixels, 3) b' over `bright` (pixels,); right (lights, 3) s'; weight (pixels,) share of samples that
+    were believed; residual, fourth_singular_value as in calibrate.Calibration."""
+
+    left: Float
+    right: Float
+    bright: Float
+    weight: Float
+    residual: float
+    fourth_singular_value: float
+
+
+def factors(view: View, generator: np.random.Generator) -> Pseudo:
+    """Robust factorisation of a view's grey photographs: of FACTORED pixels, then of all for these lights."""
+    image = view.samples.astype(np.float32).mean(-1).astype(np.float64) * view.scale
+    bright = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1), view.scale)
+    known = view.usable() & (image > SHADOWED * bright[:, None])
+    image /= bright[:, None]
+    noise = view.scale / float(np.median(bright))
+    drawn = generator.permutation(len(image))[:FACTORED]
+    few = factorise(image[drawn], known[drawn], 3, floor=noise)
+    weight = known.astype(np.float64)
+    for _ in range(SWEEPS):
+        left = solve_rows(image, weight, few.right)
+        weight = robust_weights(image - left @ few.right.T, known.astype(np.float64), noise)
+    return Pseudo(left, few.right, bright, weight.mean(1), few.residual, float(few.singular_values[3]))
+
+
+def outer_band(view: View) -> Int:
+    """(n,) pixels near the outline, not on it where they mix: 1.5 pixels deep, up to a tenth of the mask's radius, at least 4."""
+    padded = np.pad(view.mask.astype(np.uint8), 1)
+    depth = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1][view.mask]
+    radius = np.sqrt(view.mask.sum() / np.pi)
+    return np.flatnonzero((depth > 1.5) & (depth <= max(4.0, 0.1 * radius)))
+
+
+class _Known:
+    """Residuals of what is known of b = A b', for drawn pixels."""
+
+    def __init__(self, view: View, pseudo: Pseudo, rough: Float, generator: np.random.Generator) -> None:
+        index = view.pixel_index
+        corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], -1).reshape(-1, 4)
+        corners = corners[(corners >= 0).all(1)]
+        blocks = corners[generator.permutation(len(corners))[:BLOCKS]]
+        centres = pixel_centres(view.pixels)
+        ray = np.concatenate([centres, np.ones((len(centres), 1))], 1) @ np.linalg.inv(view.camera.K).T
+        self.of_blocks, self.rays = pseudo.left[blocks], ray[blocks]
+        self.size = np.maximum(np.linalg.norm(self.of_blocks, axis=2).mean(1) ** 2, 1e-300)
+        pairs = generator.integers(0, len(pseudo.left), (2, PAIRS))
+        self.of_pairs, self.brightness = pseudo.left[pairs], np.log(pseudo.bright[pairs])
+        chroma = log_chroma(view)
+        apart = ((chroma[pairs[0]] - chroma[pairs[1]]) ** 2).sum(1)
+        self.alike = np.exp(-apart / (2 * ONE_COLOUR**2))
+        band = outer_band(view)
+        band = band[generator.permutation(len(band))[:BAND]]
+        self.of_band, self.rough = pseudo.left[band], rough[band]
+
+    def curl(self, A: Float) -> Float:
+        """(blocks,) of the slopes, up to the factor that keeps it from collapsing."""
+        cofactors = np.stack([np.cross(A[1], A[2]), np.cross(A[2], A[0])])
+        h = self.of_blocks @ (A / np.sqrt(np.linalg.norm(cofactors))).T
+        h[..., 2] = (h * self.rays).sum(-1)
+        middle = h.mean(1)
+        right = (h[:, 1] + h[:, 3] - h[:, 0] - h[:, 2]) / 2
+        down = (h[:, 2] + h[:, 3] - h[:, 0] - h[:, 1]) / 2
+        along_y = middle[:, 2] * down[:, 0] - middle[:, 0] * down[:, 2]
+        along_x = middle[:, 2] * right[:, 1] - middle[:, 1] * right[:, 2]
+        curl: Float = (along_y - along_x) / self.size
+        return curl
+
+    def residuals(self, A: Float, h: float, curl_scale: float) -> Float:
+        """Roots of the three robust losses, each of mean up to its weight, signed so that they are smooth."""
+        curl = self.curl(A) / (CAUCHY_95 * curl_scale)
+        albedo = np.log(np.maximum(np.linalg.norm(self.of_pairs @ A.T, axis=2), 1e-300)) + self.brightness
+        apart = (albedo[0] - albedo[1]) / h
+        off = (normalise(self.of_band @ A.T) - self.rough) / ROUGH
+        off /= np.sqrt(1 + (off**2).sum(1, keepdims=True))
+        return np.concatenate(
+            [
+                np.sign(curl) * np.sqrt(np.log1p(curl**2) / len(curl)),
+                np.sign(apart) * np.sqrt(-np.expm1(-(apart**2) / 2) * self.alike / max(float(self.alike.sum()), 1e-300)),
+                off.ravel() * np.sqrt(SHARE_OF_OUTLINE / max(len(off), 1)),
+            ]
+        )
+
+
+def log_chroma(view: View) -> Float:
+    """(pixels, 3) logarithm of the colour that all lights together give a pixel, grey being 0."""
+    total = np.maximum(view.samples.sum(1, dtype=np.float64), 1.0)
+    chroma: Float = np.log(total / total.mean(1, keepdims=True))
+    return chroma
+
+
+def _unimodular(A: Float) -> Float:
+    scaled: Float = A / np.cbrt(max(abs(float(np.linalg.det(A))), 1e-300))
+    return scaled
+
+
+def resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, generator: np.random.Generator) -> Float:
+    """(3, 3) A of b = A b', camera frame, |det A| = 1; rough (pixels, 3): the inflated silhouette's normals; start (3, 3): first guess."""
+    known = _Known(view, pseudo, rough, generator)
+    A = _unimodular(start)
+    for h in np.geomspace(LOOSE, TIGHT, SWEEPS):
+        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(known.curl(A)))), 1e-12)
+
+        def residuals(x: NDArray[np.float64], h: float = float(h), scale: float = scale) -> Float:
+            return known.residuals(_unimodular(x.reshape(3, 3)), h, scale)
+
+        A = _unimodular(least_squares(residuals, A.ravel(), max_nfev=20).x.reshape(3, 3))
+    return A

@@ -1,0 +1,150 @@
+"""Whether a reconstruction is to be trusted, from what can be seen without the truth.
+
+misfit        of the image model, as a share of the images' signal, without the share that is noise
+outline_px    area between the mesh's silhouettes and the masks over the masks' outlines: by how far outlines are off, in the mean
+views_deg     median over the vertices of the standard deviation of different views' normals at the same vertex
+expected_deg  mean of the vertices' expected errors: sqrt(pi / 2) times the stated standard deviation along a tangent (stated.py)
+
+Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
+sigma = median |I(x - 1) - 2 I(x) + I(x + 1)| / (0.6745 sqrt(6)); vertices interpolate between four pixels, which leaves two thirds of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.camera import project
+from mvps.cores import on_cores
+from mvps.finding import Finding
+from mvps.material import POOR_FIT
+from mvps.mesh import normalise
+from mvps.scene import RELIABLE, Capture, Float, Int, Material, Surface, View
+from mvps.silhouette import mask_distances, sampled
+from mvps.visibility import RayCaster, camera_hits, ray_caster, visible_vertices
+
+BAD_DEG = 10.0
+"""Mean error of normals from which a result is of no use as a measurement."""
+
+CONTRADICTION_DEG = BAD_DEG / np.sqrt(2)
+"""Standard deviation between views above which they contradict each other: with as large an error that they share the sum is BAD_DEG."""
+
+OUTLINE_PIXELS = 1.0
+"""Mean error of outlines that masks of whole pixels cannot explain."""
+
+BAND_PIXELS = 8.0
+"""Farthest from a mask's outline that pixels are asked for the mesh."""
+
+INTERPOLATED = 2 / 3
+"""Part of the pixels' noise that is left between four of them, root mean square over all places."""
+
+LIGHTS_ASKED = 4
+"""Photographs of each view from which its noise is estimated."""
+
+
+def noise_share(capture: Capture) -> float:
+    """Standard deviation of the grey photographs' noise over the root mean square of their signal; median over photographs."""
+
+    def of_view(view: View) -> list[float]:
+        shares = []
+        for k in range(0, len(view.lights), max(1, len(view.lights) // LIGHTS_ASKED)):
+            if not view.usable([k]).any():
+                continue
+            image = np.full(view.mask.shape, np.nan)
+            image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
+            second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
+            second = second[np.isfinite(second)]
+            level = np.sqrt(np.nanmean(image**2))
+            if len(second) and level > 0:
+                shares.append(float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6)) / level))
+        return shares
+
+    found = [share for shares in on_cores(of_view, capture.views) for share in shares]
+    return float(np.median(found)) if found else 0.0
+
+
+def expected_deg(material: Material) -> float:
+    """Mean expected error of the seen vertices' normals, degrees, none over 90; 90 where none is seen."""
+    seen = material.confidence[material.confidence > 0]
+    expected = np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(1 / seen - 1))
+    return float(np.minimum(expected, 90).mean()) if len(seen) else 90.0
+
+
+def _silhouette(caster: RayCaster, view: View, distance: NDArray[np.float32]) -> tuple[float, float]:
+    """Pixels between the mesh's silhouette and the mask, and the length of the mask's outline in pixels."""
+    near = np.argwhere(np.abs(distance) < BAND_PIXELS)
+    hit = camera_hits(caster, view.camera, near).face >= 0
+    # The band of half a pixel to either side has the outline's length as its area.
+    return float((hit != view.mask[tuple(near.T)]).sum()), float((np.abs(distance) < 0.5).sum())
+
+
+def outline_px(capture: Capture, surface: Surface) -> float:
+    """Mean distance of the mesh's outlines from the masks', pixels."""
+    caster = ray_caster(surface)
+    wrong, length = np.sum(on_cores(lambda v, d: _silhouette(caster, v, d), capture.views, mask_distances(capture)), axis=0)
+    return float(wrong / max(length, 1.0))
+
+
+def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.float32]]) -> float:
+    """Median standard deviation of the normals of views at vertices that several see, degrees; 0 where none is. pictures: the views'
+    normals (height, width, 3), NaN outside the masks."""
+    caster = ray_caster(surface)
+
+    def of_view(view: View, picture: NDArray[np.float32]) -> tuple[Int, Float]:
+        index = np.flatnonzero(visible_vertices(caster, view.camera))
+        known = np.nan_to_num(picture)
+        normal = sampled(known, project(view.camera, surface.vertices[index])[0]).astype(float)
+        found = np.linalg.norm(normal, axis=1) > 0.5
+        return index[found], normalise(normal[found])
+
+    total, count = np.zeros((len(surface.vertices), 3)), np.zeros(len(surface.vertices))
+    for index, normal in on_cores(of_view, capture.views, pictures):
+        total[index] += normal
+        count[index] += 1
+    several = count > 1
+    # Of unit vectors: the mean square distance to their mean, over one view less than there are.
+    n = count[several]
+    variance = (1 - (total[several] ** 2).sum(1) / n**2) * n / (n - 1)
+    return float(np.degrees(np.sqrt(max(float(np.median(variance)), 0.0)))) if several.any() else 0.0
+
+
+def signs(
+    capture: Capture, surface: Surface, material: Material, pictures: Sequence[NDArray[np.float32]], residual: float
+) -> dict[str, float]:
+    """The figures above. residual: of the last round, as a share of the images' signal."""
+    noise = INTERPOLATED * noise_share(capture)
+    return {
+        "misfit": float(np.sqrt(max(residual**2 - noise**2, 0.0))),
+        "noise": noise,
+        "outline_px": outline_px(capture, surface),
+        "views_deg": views_deg(capture, surface, pictures),
+        "expected_deg": expected_deg(material),
+    }
+
+
+def verdict(found: Mapping[str, float], settled: tuple[str, str], findings: Sequence[Finding] = ()) -> tuple[str, str]:
+    """Status in a word or two, and a sentence, from `signs`, from whether the rounds settled (status and sentence) and from what checks of
+    the capture found and could not mend."""
+    if found["misfit"] > POOR_FIT:
+        return "poor fit", (
+            f"The model fits badly: it leaves {100 * found['misfit']:.0f} % of the images' signal unexplained (good fits leave under"
+            f" {100 * POOR_FIT:.0f} %). Expect wrong normals and lights; metals and mirrors are likely reasons, as are wrong masks"
+            " or poses."
+        )
+    doubts = [f"{one.where}: {one.text}" for one in findings if not one.mended]
+    if found["outline_px"] > OUTLINE_PIXELS:
+        doubts.append(f"outlines of the mesh and the masks are {found['outline_px']:.1f} px apart (good ones are under {OUTLINE_PIXELS:g})")
+    if found["views_deg"] > CONTRADICTION_DEG:
+        doubts.append(
+            f"different views' normals at the same place are {found['views_deg']:.0f} deg apart (good ones under {CONTRADICTION_DEG:.0f})"
+        )
+    if found["expected_deg"] > BAD_DEG:
+        doubts.append(f"normals are expected to be {found['expected_deg']:.0f} deg off in the mean")
+    if doubts:
+        return "doubtful", (
+            f"There is reason to doubt this shape: {'; '.join(doubts)}. Look at masks and poses first, then whether there are enough views"
+            " and lights."
+        )
+    return settled

@@ -1,0 +1,71 @@
+"""mvps.checks.ambient: ambient light is found and taken off, photographs without stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from mvps.checks.ambient import ambient, ambient_share
+from mvps.scene import Capture, View
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+
+@cache
+def clean(seed: int = 0, strength: float = 1.0, noise: float = 0.002) -> Capture:
+    return render_capture(SceneSettings(views=4, lights=10, size=96, seed=seed, strength=strength, noise=noise))[0]
+
+
+def lit(view: View, share: float) -> View:
+    """The view with its mean over the lights added to every photograph, its median a share of theirs."""
+    image = view.samples.mean(1, keepdims=True)
+    image *= share * np.median(view.samples) / np.median(image)
+    room = 65535 / (view.samples.max() + image.max())
+    return replace(view, samples=np.rint((view.samples + image) * room).astype(np.uint16))
+
+
+def with_ambient(capture: Capture, share: float) -> Capture:
+    return Capture(capture.name, tuple(lit(view, share) for view in capture.views))
+
+
+@pytest.mark.parametrize(("seed", "strength", "noise"), [(0, 1.0, 0.002), (1, 0.0, 0.002), (2, 2.0, 0.01), (3, 1.0, 0.03)])
+def test_photographs_without_stay_as_they_are(seed: int, strength: float, noise: float) -> None:
+    capture = clean(seed, strength, noise)
+    after, found = ambient(capture)
+    assert after is capture and not found
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_it_is_found_and_most_of_it_taken_off(share: float) -> None:
+    given = with_ambient(clean(), share)
+    after, (finding,) = ambient(given)
+    assert finding.about == "radiometry" and finding.mended
+    for before, harmed, mended in zip(clean().views, given.views, after.views, strict=True):
+        lit_ = (before.samples > np.median(before.samples)) & mended.usable()[..., None] & harmed.usable()[..., None]
+        scale = np.median(mended.samples[lit_] / before.samples[lit_])
+        off, was = (np.abs(v.samples / scale - before.samples)[lit_].mean() for v in (mended, harmed))
+        assert off < 0.6 * was
+    assert ambient_share(after) < 0.3 * ambient_share(given)
+
+
+def test_what_is_no_data_stays_so() -> None:
+    given = with_ambient(clean(), 0.2).without({"view_02": [3]})
+    after, _ = ambient(given)
+    assert not after.views[1].shown[2] and after.views[1].shown.sum() == 9
+
+
+def test_inter_reflection_is_none() -> None:
+    views = []
+    for view in clean().views:
+        # What a lamp sends comes back from all around, a tenth of it.
+        sent = 0.1 * np.median(view.samples, axis=0, keepdims=True) + 0.9 * view.samples
+        views.append(replace(view, samples=np.rint(sent).astype(np.uint16)))
+    assert ambient_share(Capture("lit", tuple(views))) == 0
+
+
+def test_few_lights_say_nothing() -> None:
+    few = clean().select({view.name: view.lights[:4] for view in clean().views})
+    assert ambient(with_ambient(few, 0.2))[1] == []

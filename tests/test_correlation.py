@@ -1,0 +1,53 @@
+"""mvps.correlation: lights of metals and of matte surfaces, from normals that are a few degrees off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvps.correlation import TOWARDS_CAMERA, directions, glossy_lights, is_glossy, searched
+from mvps.mesh import angles_deg, normalise
+
+RNG = np.random.default_rng(0)
+TRUE_NORMAL = directions(6000)[directions(6000)[:, 2] < -0.1]
+NORMAL = normalise(TRUE_NORMAL + RNG.normal(0, 0.12, TRUE_NORMAL.shape))
+LIGHT = normalise(np.concatenate([RNG.normal(0, 0.6, (12, 2)), -np.ones((12, 1))], axis=1))
+INTENSITY = RNG.uniform(0.5, 2, 12)
+ALBEDO = RNG.uniform(0.3, 1, (len(NORMAL), 1))
+
+
+def photographed(sharpness: float, body: float) -> np.ndarray:
+    """(n, lights) of patches of albedo whose lobe has this sharpness, beside this part of diffuse light."""
+    half = normalise(LIGHT + TOWARDS_CAMERA)
+    lobe = np.exp(sharpness * (TRUE_NORMAL @ half.T - 1)) if sharpness else 0
+    image: np.ndarray = ALBEDO * np.maximum(TRUE_NORMAL @ LIGHT.T, 0) * (body + lobe) * INTENSITY
+    return image
+
+
+@pytest.mark.parametrize("sharpness", [8.0, 20.0, 60.0])
+def test_lights_of_a_metal(sharpness: float) -> None:
+    image = photographed(sharpness, 0.0)
+    assert is_glossy([image], [NORMAL], np.random.default_rng(0))
+    found = glossy_lights(image, NORMAL)
+    assert angles_deg(normalise(found), LIGHT).mean() < 5
+    level = np.linalg.norm(found, axis=1) / INTENSITY
+    assert level.std() / level.mean() < 0.15
+
+
+def test_a_matte_object_is_none() -> None:
+    image = photographed(0.0, 1.0)
+    assert not is_glossy([image], [NORMAL], np.random.default_rng(0))
+    assert angles_deg(searched(image, NORMAL, False)[0], LIGHT).mean() < 5
+    assert not is_glossy([photographed(60.0, 0.7)], [NORMAL], np.random.default_rng(0))
+
+
+def test_each_view_may_have_lights_of_its_own() -> None:
+    images = [photographed(20.0, 0.0)[:, :6], photographed(20.0, 0.0)[:, 6:]]
+    assert is_glossy(images, [NORMAL, NORMAL], np.random.default_rng(0))
+
+
+def test_a_photograph_without_light_has_finite_lights() -> None:
+    image = photographed(20.0, 0.0)
+    image[:, 3] = 0
+    found = glossy_lights(image, NORMAL)
+    assert np.isfinite(found).all() and (np.linalg.norm(found, axis=1) > 0).all()

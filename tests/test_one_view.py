@@ -1,0 +1,103 @@
+"""One view: lights without calibration, normals, and the open surface that they integrate to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvps.evaluate import evaluate_result
+from mvps.evaluate import main as evaluate
+from mvps.joint.bas_relief import bas_relief, turned
+from mvps.load import read_capture
+from mvps.mesh import angles_deg
+from mvps.oneview import distance_of, without_misfits
+from mvps.progress import Progress
+from mvps.reconstruct import Settings, reconstruct
+from mvps.reconstruct import main as reconstruct_main
+from mvps.scene import Capture, CaptureError, Law, Lights, Truth
+from mvps.synthetic.files import write_capture
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[Capture, Truth]:
+    return render_capture(SceneSettings(views=1, lights=24, size=80, seed=4))
+
+
+def test_the_bas_relief_is_found_by_the_lobes(made: tuple[Capture, Truth]) -> None:
+    """A third flatter than true and leaning by 11 degrees, whose Lambertian images are the same."""
+    capture, truth = made
+    view = capture.views[0]
+    normal = truth.normals[view.name][view.mask].astype(float)
+    direction, intensity = truth.direction[view.name], truth.intensity[view.name]
+    white = view.radiance().mean(2) / intensity.mean(1)
+    albedo = np.median(white / np.maximum(normal @ direction.T, 0.2), axis=1)
+    G = view.camera.rotation.T @ np.array([[1, 0, 0], [0, 1, 0], [0.2, -0.05, 0.67]]) @ view.camera.rotation
+    bent, shade, light, strength = turned(G, normal, albedo, direction, intensity.mean(1))
+    assert angles_deg(light, direction).mean() > 5 and angles_deg(bent, normal).mean() > 8
+    lights = (light, strength[:, None] * intensity / intensity.mean(1, keepdims=True))
+    back = bas_relief(view, bent, shade, lights, Law((8.0, 32.0, 128.0)), np.random.default_rng(0), torch.device("cpu"))
+    straight, _, found, _ = turned(back, bent, shade, light, strength)
+    assert angles_deg(found, direction).mean() < 1.5
+    assert angles_deg(straight, normal).mean() < 3
+
+
+def test_a_capture_of_one_view_becomes_a_result_that_evaluate_reads(made: tuple[Capture, Truth], tmp_path: Path) -> None:
+    capture, truth = made
+    write_capture(capture, truth, tmp_path / "capture")
+    reconstruct_main([str(tmp_path / "capture"), "--out", str(tmp_path / "result"), "--preset", "draft", "--quiet"])
+    evaluate([str(tmp_path / "result"), "--truth", str(tmp_path / "capture"), "--quiet"])
+    errors = evaluate_result(tmp_path / "result", tmp_path / "capture")
+    assert errors["light_error_deg"] < 6 and errors["map_normal_error_deg"] < 8
+    assert errors["mesh_coverage"] == 1
+    for name in ("mesh.ply", "model.glb", "lights.json", "material.npz", "normals/view_01.npy", "report.html", "metrics.json"):
+        assert (tmp_path / "result" / name).exists()
+    metrics = (tmp_path / "result" / "metrics.json").read_text()
+    assert "One view:" in metrics and "the world origin's" in metrics
+
+
+@pytest.mark.parametrize(("name", "lights", "normals"), [("ball", 3.5, 4.0), ("bear", 4.0, 8.0)])
+def test_photographs_without_calibration(captures: Path, tmp_path: Path, name: str, lights: float, normals: float) -> None:
+    """Photographs of DiLiGenT (Shi et al. 2016)."""
+    reconstruct_main([str(captures / name), "--out", str(tmp_path / "result"), "--quiet"])
+    errors = evaluate_result(tmp_path / "result", captures / name)
+    assert errors["light_error_deg"] < lights
+    assert errors["map_normal_error_deg"] < normals
+
+
+@pytest.mark.parametrize(("name", "normals"), [("ball", 2.5), ("bear", 5.5)])
+def test_photographs_under_given_lights(captures: Path, tmp_path: Path, name: str, normals: float) -> None:
+    reconstruct_main([str(captures / name), "--out", str(tmp_path / "result"), "--calibrated-lights", "--quiet"])
+    assert evaluate_result(tmp_path / "result", captures / name)["map_normal_error_deg"] < normals
+
+
+def test_photographs_that_fit_no_surface_are_left_out(made: tuple[Capture, Truth]) -> None:
+    capture, truth = made
+    name = capture.views[0].name
+    direction = truth.direction[name].copy()
+    direction[[2, 7, 11]] = direction[[11, 2, 7]]
+    device = torch.device("cpu")
+    right, wrong = (Lights((d,), (truth.intensity[name],), True) for d in (truth.direction[name], direction))
+    assert without_misfits(capture, right, device)[1] == []
+    after, findings = without_misfits(capture, wrong, device)
+    assert [one.where for one in findings] == [f"{name}/003", f"{name}/008", f"{name}/012"]
+    assert np.flatnonzero(~after.views[0].shown).tolist() == [2, 7, 11]
+    few = capture.select({name: capture.views[0].lights[:8]})
+    assert without_misfits(few, Lights((direction[:8],), (truth.intensity[name][:8],), True), device) == (few, [])
+
+
+def test_too_few_photographs_are_refused(captures: Path) -> None:
+    capture = read_capture(captures / "ball", lights={"view_01": [1, 20, 60]})
+    with pytest.raises(CaptureError, match="wanted at least 4 photographs of the one view"):
+        reconstruct(capture, Settings("ball"), None, Progress())
+
+
+def test_the_distance_is_the_origins_where_that_is_seen(made: tuple[Capture, Truth], captures: Path) -> None:
+    view = made[0].views[0]
+    assert distance_of(view)[0] == pytest.approx(view.camera.translation[2])
+    ball = read_capture(captures / "ball", lights={"view_01": [1]}).views[0]
+    assert distance_of(ball)[0] == pytest.approx(ball.camera.focal_length)

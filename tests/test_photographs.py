@@ -1,0 +1,117 @@
+"""mvps.checks.photographs: what does not belong is found by its name, what does belong stays as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mvps.calibrate import colour_ratios
+from mvps.checks.photographs import photographs
+from mvps.joint.reflectance import _ratios
+from mvps.scene import Capture, View
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+VIEW, LIGHT = 4, 5
+"""Places of the photograph that is spoilt."""
+
+Samples = NDArray[np.uint16]
+
+
+@pytest.fixture(scope="module")
+def clean() -> Capture:
+    return render_capture(SceneSettings(views=8, lights=16, size=128))[0]
+
+
+def spoilt(capture: Capture, change: Callable[[Samples, View], None]) -> Capture:
+    views = list(capture.views)
+    samples = views[VIEW].samples.copy()
+    change(samples, views[VIEW])
+    views[VIEW] = replace(views[VIEW], samples=samples)
+    return Capture(capture.name, tuple(views))
+
+
+def image_of(view: View, samples: Samples, light: int) -> Samples:
+    image = np.zeros((*view.mask.shape, 3), np.uint16)
+    image[view.mask] = samples[:, light]
+    return image
+
+
+def moved(samples: Samples, view: View) -> None:
+    samples[:, LIGHT] = np.roll(image_of(view, samples, LIGHT), (3, 6), (0, 1))[view.mask]
+
+
+def black(samples: Samples, view: View) -> None:
+    samples[:, LIGHT] //= 1000
+
+
+def flashed(samples: Samples, view: View) -> None:
+    samples[:, LIGHT] = np.minimum(samples[:, LIGHT] + samples.mean(1), view.saturation - 1).astype(np.uint16)
+
+
+def other_view(capture: Capture) -> Callable[[Samples, View], None]:
+    def change(samples: Samples, view: View) -> None:
+        other = capture.views[0]
+        samples[:, LIGHT] = image_of(other, other.samples, LIGHT)[view.mask]
+
+    return change
+
+
+def swapped(samples: Samples, view: View) -> None:
+    samples[:, [LIGHT, 9]] = samples[:, [9, LIGHT]]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        SceneSettings(views=6, lights=12, size=96),
+        SceneSettings(views=6, lights=12, size=96, seed=1, free_lights=True),
+        SceneSettings(views=4, lights=6, size=96, seed=2, strength=2, noise=0.02),
+        SceneSettings(views=3, lights=3, size=64, seed=3),
+    ],
+)
+def test_clean_captures_stay_as_they_are(settings: SceneSettings) -> None:
+    capture, _ = render_capture(settings)
+    after, found = photographs(capture)
+    assert after is capture and not found
+
+
+@pytest.mark.parametrize(
+    ("change", "words"), [(moved, "moved by about 6 pixels to the right and 3 down"), (black, "black"), (flashed, "second")]
+)
+def test_a_spoilt_photograph_is_found_and_left_out(clean: Capture, change: Callable[[Samples, View], None], words: str) -> None:
+    after, found = photographs(spoilt(clean, change))
+    assert [one.where for one in found] == [f"view_{VIEW + 1:02d}/{LIGHT + 1:03d}"]
+    assert words in found[0].text and found[0].mended
+    shown = np.stack([view.shown for view in after.views])
+    assert not shown[VIEW, LIGHT] and shown.sum() == shown.size - 1
+
+
+def test_a_photograph_from_another_view_is_found(clean: Capture) -> None:
+    after, found = photographs(spoilt(clean, other_view(clean)))
+    assert [one.where for one in found] == [f"view_{VIEW + 1:02d}/{LIGHT + 1:03d}"]
+    assert "another view" in found[0].text
+    assert not after.views[VIEW].shown[LIGHT]
+
+
+def test_photographs_of_a_rig_that_changed_places_are_put_back(clean: Capture) -> None:
+    after, found = photographs(spoilt(clean, swapped))
+    assert {one.where for one in found} == {f"view_{VIEW + 1:02d}/006", f"view_{VIEW + 1:02d}/010"}
+    assert np.array_equal(after.views[VIEW].samples, clean.views[VIEW].samples)
+    assert all(a.samples is b.samples for i, (a, b) in enumerate(zip(clean.views, after.views, strict=True)) if i != VIEW)
+
+
+def test_what_was_left_out_does_not_colour_the_lights(clean: Capture) -> None:
+    left = clean.without({clean.views[0].name: [3]}).views[0]
+    whole, ratio = colour_ratios(clean.views[0]), colour_ratios(left)
+    assert np.allclose(np.delete(ratio, 2, 0), np.delete(whole, 2, 0), atol=0.01) and np.allclose(ratio[2], 1)
+
+
+def test_lights_of_which_no_sample_speaks_are_white() -> None:
+    sums = [(np.array([[2.0, 2.2, 1.8], [0.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]))]
+    ratios = _ratios(sums, one_rig=False)[0]
+    assert np.isfinite(ratios).all() and (ratios > 0).all() and np.allclose(ratios.mean(1), 1)

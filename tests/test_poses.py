@@ -1,0 +1,147 @@
+"""Poses: motions and misses have the stated derivatives, small pose errors are found and undone, right poses stay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import mvps.checks.poses
+from mvps.camera import project
+from mvps.checks.coherence import coherence, jacobian
+from mvps.checks.outlines import by_other_half, outlines_of
+from mvps.checks.poses import by_silhouettes, poses
+from mvps.joint.blocks import Vertices
+from mvps.joint.bundle import Model, aligned
+from mvps.mesh import isotropic_remesh, vertex_normals
+from mvps.motions import UNKNOWNS, Object, derivatives, gauge, image_derivatives, moved, with_motions, without_gauge
+from mvps.scene import Capture, Float, Law
+from mvps.synthetic.scene import Scene, make_scene, render_capture
+from mvps.synthetic.settings import SceneSettings
+
+VIEWS = 8
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(SceneSettings(views=VIEWS, lights=6, size=96, strength=0.0))
+
+
+@pytest.fixture(scope="module")
+def clean(scene: Scene) -> Capture:
+    return render_capture(SceneSettings(views=VIEWS, lights=6, size=96, strength=0.0), scene)[0]
+
+
+def shifts(pixels: float) -> Float:
+    """Motions of all cameras whose unknowns have this standard deviation."""
+    return np.random.default_rng(3).normal(0, pixels, (VIEWS, UNKNOWNS))
+
+
+def left(clean: Capture, body: Object, motions: Float) -> float:
+    """Root mean square of motions, pixels, less what a similarity of the world does."""
+    basis = gauge([view.camera for view in clean.views], body)
+    return float(np.sqrt((without_gauge(motions, basis) ** 2).mean()))
+
+
+def test_projections_move_as_the_derivatives_say(clean: Capture) -> None:
+    camera, body = clean.views[1].camera, Object(np.array([1.0, -2.0, 3.0]), 70.0)
+    points = body.centre + np.random.default_rng(0).normal(0, 30, (20, 3))
+    local = points @ camera.rotation.T + camera.translation
+    said = image_derivatives(camera, points) @ derivatives(camera, body, local)
+    for k, unit in enumerate(np.eye(UNKNOWNS)):
+        ends = [project(moved(camera, body, side * 1e-3 * unit), points)[0] for side in (-1, 1)]
+        np.testing.assert_allclose(said[..., k], (ends[1] - ends[0]) / 2e-3, atol=1e-6)
+    # A unit moves the object's rim by about a pixel.
+    rim = body.centre + body.radius * camera.rotation[0]
+    at = image_derivatives(camera, rim[None]) @ derivatives(camera, body, (rim @ camera.rotation.T + camera.translation)[None])
+    np.testing.assert_allclose(np.abs(at[0]).max(0)[[2, 3, 4, 5]], 1, atol=0.1)
+
+
+def test_gauge_is_what_similarities_of_the_world_undo(clean: Capture) -> None:
+    body = Object(np.zeros(3), 70.0)
+    cameras = [view.camera for view in clean.views]
+    basis = gauge(cameras, body)
+    points = np.random.default_rng(0).normal(0, 30, (50, 3))
+    slopes = [image_derivatives(c, points) @ derivatives(c, body, points @ c.rotation.T + c.translation) for c in cameras]
+    for motion in basis.T.reshape(-1, VIEWS, UNKNOWNS):
+        moves = np.concatenate([(s @ m).ravel() for s, m in zip(slopes, motion, strict=True)])
+        # A field of a turn, a shift and a growth about the origin.
+        fields = [np.cross(axis, points) for axis in np.eye(3)] + [np.tile(axis, (50, 1)) for axis in np.eye(3)] + [points]
+        seen = np.stack(
+            [
+                np.concatenate([np.einsum("nic,nc->ni", image_derivatives(c, points), f @ c.rotation.T).ravel() for c in cameras])
+                for f in fields
+            ]
+        )
+        rest = moves - seen.T @ np.linalg.lstsq(seen.T, moves, rcond=None)[0]
+        assert np.abs(rest).max() < 1e-9 + 1e-6 * np.abs(moves).max()
+
+
+def test_misses_change_as_the_jacobian_says(clean: Capture) -> None:
+    outlines = outlines_of(with_motions(clean, outlines_of(clean).body, shifts(1.0)))
+    cameras = list(outlines.cameras)
+    found = coherence(cameras, outlines.fields, outlines.body, 2, outlines.points[2])
+    said = jacobian(cameras, outlines.fields, outlines.body, 2, found)
+    motions = np.random.default_rng(5).normal(0, 0.1, (VIEWS, UNKNOWNS))
+    ends = [coherence(outlines.after(side * motions), outlines.fields, outlines.body, 2, outlines.points[2]).miss for side in (-1, 1)]
+    true, expected = (ends[1] - ends[0]) / 2, np.einsum("njk,jk->n", said, motions)
+    hit = np.abs(found.miss) < 5
+    assert hit.sum() > 30
+    assert np.median(np.abs(true - expected)[hit]) < 0.1 * np.median(np.abs(true)[hit])
+    # Where other views decide from one moment to the next there is no derivative.
+    assert np.corrcoef(true[hit], expected[hit])[0, 1] > 0.9
+
+
+def test_right_poses_stay(clean: Capture) -> None:
+    after, findings = poses(clean)
+    assert after is clean
+    assert findings == []
+
+
+def test_one_view_has_no_say(clean: Capture) -> None:
+    alone = Capture("alone", clean.views[:1])
+    assert poses(alone) == (alone, [])
+
+
+def test_pose_errors_of_a_pixel_are_found_and_undone(clean: Capture) -> None:
+    body, error = outlines_of(clean).body, shifts(1.0)
+    # Too few lights for the photographs to be asked.
+    wrong = with_motions(clean.select({view.name: view.lights[:2] for view in clean.views}), body, error)
+    after, findings = poses(wrong)
+    # Cameras moved by more than a pixel leave the world's frame in doubt.
+    assert [(one.about, one.where, one.mended) for one in findings] == [("pose", "all views", True), ("pose", "all views", False)]
+    outlines = outlines_of(wrong)
+    motions = by_silhouettes(outlines, np.zeros((VIEWS, UNKNOWNS)))
+    assert motions is not None
+    assert left(clean, body, error + motions) < 0.5 * left(clean, body, error)
+    for view, camera in zip(after.views, outlines.after(motions), strict=True):
+        np.testing.assert_array_equal(view.camera.rotation, camera.rotation)
+        assert view.samples is not None and view.mask is clean.views[int(view.name[5:]) - 1].mask
+
+
+def test_the_other_half_decides(clean: Capture) -> None:
+    body = outlines_of(clean).body
+    for error, found in ((0.0, False), (1.0, True)):
+        fall, noise = by_other_half(outlines_of(with_motions(clean, body, shifts(error))))
+        assert (fall > 3 * noise) == found
+
+
+def test_what_cannot_be_mended_is_said(clean: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    wrong = with_motions(clean, outlines_of(clean).body, shifts(1.0))
+    monkeypatch.setattr(mvps.checks.poses, "by_silhouettes", lambda outlines, still: None)
+    after, (finding,) = poses(wrong)
+    assert after is wrong and not finding.mended
+
+
+def test_photographs_undo_what_silhouettes_leave(scene: Scene, clean: Capture) -> None:
+    body, error = outlines_of(clean).body, shifts(0.3)
+    surface = isotropic_remesh(scene.surface, 4.0)
+    normal = torch.tensor(vertex_normals(surface), dtype=torch.float32)
+    start = Vertices(normal, torch.full((len(normal), 1), 0.3), torch.full((len(normal),), 0.05))
+    among = np.random.default_rng(0).permutation(len(normal)) < 1500
+    model = Model(surface, scene.lights, start, Law((), shadows=True), among)
+    lights = replace(scene.lights, one_rig=False)
+    motions, _ = aligned(with_motions(clean, body, error), lights, model, body)
+    assert left(clean, body, error + motions) < 0.35 * left(clean, body, error)

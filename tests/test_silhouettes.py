@@ -1,0 +1,166 @@
+"""mvps.checks.silhouettes: faults of masks and views are found by name and mended; what is sound stays as it is, sample for sample."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation, binary_erosion
+
+from mvps.checks.silhouettes import silhouettes
+from mvps.load import read_capture
+from mvps.scene import Bool, Camera, Capture, View
+from mvps.synthetic.files import write_capture
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+VIEWS, THIRD = 8, "view_03"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A made capture of 8 views x 4 lights x 96 x 96 pixels."""
+    place = tmp_path_factory.mktemp("made") / "capture"
+    write_capture(*render_capture(SceneSettings(views=VIEWS, lights=4, size=96)), place)
+    return place
+
+
+@pytest.fixture(scope="module")
+def sound(folder: Path) -> Capture:
+    return read_capture(folder)
+
+
+def with_masks(folder: Path, sound: Capture, edit: Callable[[Bool], Bool], only: str = "") -> Capture:
+    """The capture read with other masks, in all views or in one."""
+    for view in sound.views:
+        mask = edit(view.mask) if only in ("", view.name) else view.mask
+        cv2.imwrite(str(folder / view.name / "mask.png"), mask.astype(np.uint8) * 255)
+    try:
+        return read_capture(folder)
+    finally:
+        for view in sound.views:
+            cv2.imwrite(str(folder / view.name / "mask.png"), view.mask.astype(np.uint8) * 255)
+
+
+def wrong(capture: Capture, sound: Capture) -> int:
+    """Pixels in which masks differ."""
+    return sum(int((a.mask != b.mask).sum()) for a, b in zip(capture.views, sound.views, strict=True))
+
+
+def disc(mask: Bool, row: float, column: float, radius: float) -> Bool:
+    rows, columns = np.indices(mask.shape)
+    return (rows - row) ** 2 + (columns - column) ** 2 <= radius**2
+
+
+def without_limb(mask: Bool) -> Bool:
+    """Without the tenth of the mask that lies farthest along its longest direction."""
+    pixels = np.argwhere(mask)
+    along = (pixels - pixels.mean(0)) @ np.linalg.svd(pixels - pixels.mean(0), full_matrices=False)[2][0]
+    cut = mask.copy()
+    cut[tuple(pixels[along > np.quantile(along, 0.9)].T)] = False
+    return cut
+
+
+def with_holes(mask: Bool) -> Bool:
+    row, column = np.argwhere(mask).mean(0)
+    return mask & ~disc(mask, row, column, 4) & ~disc(mask, row + 12, column + 6, 3)
+
+
+def with_blob(mask: Bool) -> Bool:
+    return mask | disc(mask, 10, 12, 5)
+
+
+def test_a_sound_capture_stays_as_it_is(sound: Capture) -> None:
+    left, findings = silhouettes(sound)
+    assert left is sound and not findings
+
+
+@pytest.mark.parametrize("lights", [[1], [2, 6, 10, 14, 18]])
+@pytest.mark.parametrize("name", ["bunny", "armadillo", "buddha"])
+def test_captures_stay_as_they_are(captures: Path, name: str, lights: list[int]) -> None:
+    """Five views each, under few lights too: then a side of the object may be in the dark."""
+    capture = read_capture(captures / name, [1, 5, 9, 13, 17], lights)
+    left, findings = silhouettes(capture)
+    assert left is capture and not findings
+
+
+@pytest.mark.parametrize(("pixels", "only"), [(-6, THIRD), (-3, ""), (-1, ""), (1, ""), (1, THIRD), (3, ""), (6, THIRD)])
+def test_masks_that_are_off_are_moved_to_the_objects_edge(folder: Path, sound: Capture, pixels: int, only: str) -> None:
+    change = binary_dilation if pixels > 0 else binary_erosion
+    bad = with_masks(folder, sound, lambda mask: change(mask, iterations=abs(pixels)), only)
+    mended, findings = silhouettes(bad)
+    assert wrong(mended, sound) < 0.1 * wrong(bad, sound)
+    assert (findings[0].about, findings[0].where, findings[0].mended) == ("mask", only or "all views", True)
+    assert ("larger" if pixels > 0 else "smaller") in findings[0].text
+
+
+@pytest.mark.parametrize(("edit", "only"), [(without_limb, THIRD), (with_holes, ""), (with_blob, THIRD)])
+def test_parts_of_masks_are_mended(folder: Path, sound: Capture, edit: Callable[[Bool], Bool], only: str) -> None:
+    bad = with_masks(folder, sound, edit, only)
+    mended, findings = silhouettes(bad)
+    assert wrong(mended, sound) <= 0.02 * wrong(bad, sound)
+    assert len(findings) == 1 and findings[0].about == "mask" and findings[0].mended
+    assert findings[0].where == (only or ", ".join(view.name for view in sound.views))
+    for view, true in zip(mended.views, sound.views, strict=True):
+        both = view.mask & true.mask
+        np.testing.assert_array_equal(view.samples[both[view.mask]], true.samples[both[true.mask]])
+
+
+def posed(view: View, like: View) -> View:
+    return replace(view, camera=like.camera)
+
+
+@pytest.mark.parametrize("like", [0, 3])
+def test_a_view_with_anothers_pose_is_left_out(sound: Capture, like: int) -> None:
+    views = [posed(view, sound.views[like]) if view.name == THIRD else view for view in sound.views]
+    left, findings = silhouettes(Capture("swapped", tuple(views)))
+    assert [view.name for view in left.views] == [view.name for view in sound.views if view.name != THIRD]
+    assert [(one.about, one.where, one.mended) for one in findings] == [("pose", THIRD, True)]
+
+
+def test_small_errors_of_all_poses_are_left_alone(sound: Capture) -> None:
+    rng = np.random.default_rng(0)
+    views = []
+    for view in sound.views:
+        angle, pixel = rng.uniform(0, 2 * np.pi), view.camera.translation[2] / view.camera.focal_length
+        moved = view.camera.translation + 3 * pixel * np.array([np.cos(angle), np.sin(angle), 0])
+        views.append(replace(view, camera=replace(view.camera, translation=moved)))
+    capture = Capture("shaken", tuple(views))
+    left, findings = silhouettes(capture)
+    assert left is capture and not findings
+
+
+def test_what_no_view_alone_explains_is_said_and_left(sound: Capture) -> None:
+    """Half of the views with the poses of others: no one to leave out."""
+    views = [posed(view, sound.views[(at + 3) % VIEWS]) if at % 2 else view for at, view in enumerate(sound.views)]
+    capture = Capture("mixed", tuple(views))
+    left, findings = silhouettes(capture)
+    assert left is capture
+    assert [(one.where, one.mended) for one in findings] == [("all views", False)]
+
+
+def test_of_two_views_with_one_pose_both_are_named(sound: Capture) -> None:
+    """Seen from opposite sides an object's outlines are mirror images: the hull cannot tell which of the two is wrong."""
+    views = [posed(view, sound.views[6]) if view.name == THIRD else view for view in sound.views]
+    capture = Capture("opposite", tuple(views))
+    left, findings = silhouettes(capture)
+    assert left is capture
+    assert [(one.where, one.mended) for one in findings] == [(THIRD, False), ("view_07", False)]
+
+
+def test_what_the_image_cuts_off_is_no_contradiction(sound: Capture) -> None:
+    def cut(view: View) -> View:
+        columns = np.flatnonzero(view.mask.any(0))
+        start = int(columns[0]) + (columns[-1] - columns[0]) // 3
+        camera, K = view.camera, view.camera.K.copy()
+        K[0, 2] -= start
+        kept = view.pixels[:, 1] >= start
+        narrower = Camera(K, camera.rotation, camera.translation, camera.height, camera.width - start)
+        return View(view.name, narrower, view.mask[:, start:], view.samples[kept], view.scale, view.saturation, view.lights)
+
+    views = tuple(cut(view) if k == 0 else view for k, view in enumerate(sound.views))
+    assert silhouettes(Capture("cut", views))[1] == []

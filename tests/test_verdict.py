@@ -1,0 +1,90 @@
+"""mvps.verdict: each sign measures what it says, and each can change the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sphere_scene import SphereScene, make_sphere
+
+from mvps.finding import Finding
+from mvps.scene import RELIABLE, Capture, Surface
+from mvps.verdict import expected_deg, noise_share, outline_px, signs, verdict, views_deg
+
+SETTLED = ("converged", "settled.")
+GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0}
+
+
+@pytest.fixture(scope="module")
+def scene() -> SphereScene:
+    return make_sphere(4)
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.1])
+def test_noise_is_estimated_from_the_photographs(scene: SphereScene, noise: float) -> None:
+    rng = np.random.default_rng(0)
+
+    def noisy(view):  # type: ignore[no-untyped-def]
+        level = view.samples.mean(2).std() + view.samples.mean()
+        # Grey is the mean of three channels.
+        added = rng.normal(0, noise * level * np.sqrt(3), view.samples.shape)
+        return replace(view, samples=np.clip(view.samples + added + 20000, 0, 65534).astype(np.uint16)), noise * level
+
+    views, sigmas = zip(*map(noisy, scene.capture.views), strict=True)
+    shares = [s / np.sqrt((v.samples[:, k].mean(1) ** 2).mean()) for v, s in zip(views, sigmas, strict=True) for k in (0, 5)]
+    assert noise_share(Capture("noisy", views)) == pytest.approx(float(np.median(shares)), rel=0.2)
+
+
+def test_outlines_that_are_off(scene: SphereScene) -> None:
+    surface = scene.reconstruction.surface
+    pixel = 40.0 / (0.4 * 96)
+    assert outline_px(scene.capture, surface) < 0.2
+    for shift in (1.0, 3.0):
+        grown = Surface(surface.vertices * (1 + shift * pixel / 40.0), surface.faces)
+        assert outline_px(scene.capture, grown) == pytest.approx(shift, abs=0.35)
+
+
+def test_views_that_contradict_each_other(scene: SphereScene) -> None:
+    surface, maps = scene.reconstruction.surface, list(scene.reconstruction.normal_maps)
+    assert views_deg(scene.capture, surface, maps) < 1.5
+    about = [Rotation.from_rotvec(np.radians(12) * view.camera.rotation[2]).as_matrix() for view in scene.capture.views]
+    turned = [(m @ R.T).astype(np.float32) for m, R in zip(maps, about, strict=True)]
+    assert views_deg(scene.capture, surface, turned) > 5
+    assert views_deg(Capture("one", scene.capture.views[:1]), surface, maps[:1]) == 0
+
+
+def test_expected_error_is_the_stated_one(scene: SphereScene) -> None:
+    material = scene.reconstruction.material
+    sigma = np.radians(4.0)
+    stated = replace(material, confidence=np.full(len(material.albedo), 1 / (1 + (sigma / RELIABLE) ** 2)))
+    assert expected_deg(stated) == pytest.approx(4.0 * np.sqrt(np.pi / 2), rel=1e-6)
+    assert expected_deg(replace(material, confidence=np.zeros(len(material.albedo)))) == 90
+
+
+def test_noise_is_no_misfit(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    found = signs(scene.capture, r.surface, r.material, r.normal_maps, 0.2)
+    assert found["misfit"] == pytest.approx(np.sqrt(0.04 - found["noise"] ** 2)) and set(found) == set(GOOD)
+
+
+def test_what_could_not_be_mended_is_a_doubt() -> None:
+    name, text = verdict(GOOD, SETTLED, [Finding("mask", "view_02", "is odd", True), Finding("pose", "view_03", "is wrong", False)])
+    assert name == "doubtful" and "view_03: is wrong" in text and "view_02" not in text
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "said"),
+    [
+        ({}, "converged", "settled"),
+        ({"misfit": 0.15}, "poor fit", "15 % of the images' signal"),
+        ({"outline_px": 1.5}, "doubtful", "1.5 px apart"),
+        ({"views_deg": 8.0}, "doubtful", "8 deg apart"),
+        ({"expected_deg": 12.0}, "doubtful", "12 deg off"),
+        ({"views_deg": 8.0, "expected_deg": 12.0}, "doubtful", "same place are 8 deg"),
+    ],
+)
+def test_every_sign_counts(change: dict[str, float], status: str, said: str) -> None:
+    name, text = verdict(GOOD | change, SETTLED)
+    assert name == status and said in text
