@@ -31,6 +31,10 @@ from mvps.scene import GRAZING_POWER, Law
 QUADRATURE = 64
 """Nodes of Gauss and Legendre: enough for sharpness up to 10^4."""
 
+FAINTEST = -30.0
+"""Least logarithm of a Gaussian lobe's value: 1e-13 of its peak no photograph shows, and the value's square is still a normal number in
+float32. Below that processors take ten times as long over every product (docs/method.md)."""
+
 PARALLEL = 1e-6
 """Floor of 2 + 2 v.l: view and light exactly opposite have no half vector (and such a point is never lit and seen)."""
 
@@ -43,7 +47,7 @@ def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor
 def lobe(h_dot_n: Tensor, sharpness: float, microfacet: bool) -> tuple[Tensor, Tensor | float]:
     """A lobe's value (...) for h . n (...), and the derivative of its logarithm by h . n."""
     if not microfacet:
-        return torch.exp(sharpness * (h_dot_n - 1)), sharpness
+        return torch.exp((sharpness * (h_dot_n - 1)).clamp_min(FAINTEST)), sharpness
     spread = 1 + sharpness / 4 * (1 - h_dot_n**2)
     return spread**-2, sharpness * h_dot_n / spread
 
