@@ -72,6 +72,7 @@ def swapped(samples: Samples, view: View) -> None:
         SceneSettings(views=6, lights=12, size=96, seed=1, free_lights=True),
         SceneSettings(views=4, lights=6, size=96, seed=2, strength=2, noise=0.02),
         SceneSettings(views=3, lights=3, size=64, seed=3),
+        SceneSettings(views=6, lights=12, size=96, seed=1, intensity_spread=1.5),
     ],
 )
 def test_clean_captures_stay_as_they_are(settings: SceneSettings) -> None:

@@ -16,8 +16,8 @@ from mvps.synthetic.settings import SceneSettings
 
 
 @cache
-def made(seed: int, strength: float = 1.0) -> Capture:
-    return render_capture(SceneSettings(views=4, lights=16, size=96, seed=seed, strength=strength))[0]
+def made(seed: int, strength: float = 1.0, **other: float) -> Capture:
+    return render_capture(replace(SceneSettings(views=4, lights=16, size=96, seed=seed, strength=strength), **other))[0]
 
 
 def encoded(capture: Capture, name: str, bits: int) -> Capture:
@@ -29,9 +29,12 @@ def encoded(capture: Capture, name: str, bits: int) -> Capture:
     return Capture(capture.name, tuple(views))
 
 
-@pytest.mark.parametrize(("seed", "strength"), [(0, 1.0), (1, 0.0), (2, 3.0)])
-def test_linear_photographs_stay_as_they_are(seed: int, strength: float) -> None:
-    capture = made(seed, strength)
+@pytest.mark.parametrize(
+    "capture",
+    [made(0), made(1, 0.0), made(2, 3.0), made(4, lights=10, intensity_spread=1.5)],
+    ids=["gloss", "matt", "much gloss", "unequal lights"],
+)
+def test_linear_photographs_stay_as_they_are(capture: Capture) -> None:
     after, found = curve_undone(capture)
     assert not found and after is capture
 

@@ -7,7 +7,8 @@ suspect                  b = log(r_0 / median of r_d on a ring) is -1 to -4 for 
 moved                    A suspect whose edges (edges.py) agree twice as well with those of the others when it is moved.
 another object or view   A suspect whose detail is not the object's, so that moving it changes nothing: b is 0 within the spread of r_d
                          around the ring, and its edges agree in place less than half as well as elsewhere.
-black                    Its level is below the part of the view's photographs that predictions leave, and its highlights are dark too.
+black                    Its level is below the part of the view's photographs that predictions leave, its highlights are dark too, and it
+                         shows nothing of the object, or its light is not weak in other views of a rig.
 another light            In a rig (rig.py).
 """
 
@@ -25,7 +26,7 @@ from mvps.checks.prediction import LIT, PIXELS, RIDGES, Sampled, coefficients, g
 from mvps.checks.rig import rig_faults
 from mvps.cores import on_cores
 from mvps.finding import Finding
-from mvps.scene import Capture, Float, View
+from mvps.scene import Bool, Capture, Float, View
 from solvers.low_rank import MAD_TO_SIGMA
 
 FEWEST_LIGHTS = 4
@@ -110,16 +111,27 @@ def _unrelated(views: Sequence[_Predicted], same_lights: bool) -> dict[tuple[str
     return wrong
 
 
-def _dark(p: _Predicted) -> dict[tuple[str, int], str]:
-    """Photographs with less light than what predictions leave of the view's photographs."""
-    live = p.of.view.usable().any(0)
+def _faint(p: _Predicted) -> Bool:
+    """(lights,) photographs with less light than what predictions leave of the view's photographs."""
+    live: Bool = np.asarray(p.of.view.usable().any(0))
     if not live.any() or not np.isfinite(p.residual).any():
-        return {}
+        return np.zeros_like(live)
     # Of a metal many photographs are dark, but for highlights.
     brightest = np.quantile(grey(p.of.view.samples[p.of.chosen]), HIGHLIGHTS, axis=0)
-    black = live & (p.of.level < np.nanmedian(p.residual)) & (brightest < BLACK * np.median(brightest[live]))
-    numbers, level = p.of.view.lights, p.of.level
-    return {(p.of.view.name, numbers[k]): f"is black, {100 * level[k]:.2g} % as bright as the others" for k in np.flatnonzero(black)}
+    faint: Bool = live & (p.of.level < np.nanmedian(p.residual)) & (brightest < BLACK * np.median(brightest[live]))
+    return faint
+
+
+def _black(views: Sequence[_Predicted], same_lights: bool) -> dict[tuple[str, int], str]:
+    """Photographs that no light lit. A weak one does: it shows the object, and lights of a rig are weak in all views."""
+    faint = [_faint(p) for p in views]
+    weak: Any = np.mean(faint, axis=0) > 0.5 if same_lights else True
+    wrong: dict[tuple[str, int], str] = {}
+    for p, of_view in zip(views, faint, strict=True):
+        black = of_view & ~(weak & (p.b < -UNRELATED * p.spread))
+        for k in np.flatnonzero(black):
+            wrong[p.of.view.name, p.of.view.lights[k]] = f"is black, {100 * p.of.level[k]:.2g} % as bright as the others"
+    return wrong
 
 
 def _found(capture: Capture) -> tuple[Capture, dict[tuple[str, int], str], dict[tuple[str, int], str]]:
@@ -131,10 +143,7 @@ def _found(capture: Capture) -> tuple[Capture, dict[tuple[str, int], str], dict[
     if not views:
         return capture, {}, {}
     same_lights = len({view.lights for view in enough}) == 1
-    wrong: dict[tuple[str, int], str] = {}
-    for p in views:
-        wrong |= _dark(p)
-    wrong = _unrelated(views, same_lights) | wrong
+    wrong = _unrelated(views, same_lights) | _black(views, same_lights)
     # Of what is left out nothing more need be said; its light is looked for where it belongs to the view.
     if wrong or not same_lights:
         return capture, {}, wrong

@@ -5,9 +5,11 @@ I -> I^(1/2.2) and its like, breaks that. So
 
     rho(curve) = median |M - three factors| / median |M - the pixel's median|,   M = curve^-1(code) over the pixel's bright level,
 
-is least for the curve that was left in. It does not depend on exposure or albedo, and the samples that count, the brightest of each pixel,
-are the same for all curves, which keep their order. A curve is believed where undoing it lowers rho clearly, over all views and in most of
-them: gloss and inter-reflection do not look like one. Of metals, which no three factors explain, none is believed (correlation.py).
+is least for the curve that was left in. Codes and radiances of a photograph are taken over their bright level in it: under lights of
+unequal strength a curve would else make the strongest all there is, which few factors explain. So rho depends neither on exposure nor
+albedo nor on the lights' strengths, and the samples that count, the brightest of each pixel, are the same for all curves. A curve is
+believed where undoing it lowers rho clearly, over all views and in most of them: gloss and inter-reflection do not look like one. Of
+metals, which no three factors explain, none is believed (correlation.py).
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.calibrate import is_metallic
+from mvps.checks.prediction import BRIGHT_QUANTILE
 from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.hull import default_cells, signed_distance, visual_hull
@@ -61,14 +64,20 @@ PIXELS, VIEWS, SWEEPS = 300, 8, 6
 FULL = 65535
 
 
+def _over_its_level(image: Float) -> Float:
+    """Values (pixels, lights), each light's over their bright level."""
+    level: Float = np.quantile(image, BRIGHT_QUANTILE, axis=0)
+    return image / np.maximum(level, 1e-12)
+
+
 def _rho(view: View, curve: Curve, pixels: int) -> float:
     """rho of a view's photographs with a curve undone."""
     chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:pixels])
     codes = view.samples[chosen][:, view.shown]
-    image = curve(codes * view.scale).mean(-1)
-    order = np.argsort(np.argsort(codes.sum(-1, dtype=np.int64), axis=1), axis=1)
+    image = _over_its_level(curve(codes * view.scale).mean(-1))
+    order = np.argsort(np.argsort(_over_its_level(codes.mean(-1)), axis=1), axis=1)
     known = (codes < view.saturation).all(-1) & (order >= (1 - LIT_SHARE) * codes.shape[1]) & (codes.min(-1) > 0)
-    bright = np.maximum(np.quantile(image, 0.8, axis=1, keepdims=True), 1e-12)
+    bright = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True), 1e-12)
     M = image / bright
     factors = factorise(M, known, 3, SWEEPS, floor=1e-4)
     if not known.any():
