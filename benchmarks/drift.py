@@ -16,14 +16,14 @@ import numpy as np
 
 from mvps import measures
 from mvps.device import chosen_device
-from mvps.joint.photometry import SHARPNESS
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.thinned import thinned
 from mvps.load import read_capture, read_truth
 from mvps.photometric import normal_maps
+from mvps.plan import Parts, between_passes, first_pass
 from mvps.progress import Progress
-from mvps.reconstruct import Settings, first_lights, first_pass, rough_shape, shaped, stage_two
-from mvps.scene import Capture, Law, Lights, NormalMap, Truth
+from mvps.reconstruct import Settings, first_lights, rough_shape, shaped, stage_two
+from mvps.scene import Capture, Lights, NormalMap, Truth
 
 HERE = Path(__file__).resolve().parent
 EDGE, REACH, STEP = 2.0, 1.2, 0.3
@@ -48,8 +48,8 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     grid, hull = rough_shape(capture, progress)
     lights = first_lights(capture, hull, None, settings.seed, progress)
     maps = normal_maps(*thinned(capture, lights), device)
-    rough = stage_two("first refinement", capture, hull, lights, maps, Law(SHARPNESS), first_pass(True, False), settings, progress)
-    surface, state, _ = shaped(capture, grid, rough, settings, True, progress)
+    rough = stage_two("first refinement", capture, hull, lights, maps, Parts().law(), first_pass(True, False), settings, progress)
+    surface, state, _ = shaped(capture, grid, rough, settings, between_passes(True), progress)
     records = []
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))
     for k in range(rounds):
