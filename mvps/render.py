@@ -7,7 +7,7 @@ named by the lights' numbers, black where no surface is, and mask.png, white whe
 
     python -m mvps.render RESULT --turntable 72 --envmap studio.hdr --out DIR --video
 
-it writes DIR/turn_001_image.png and so on, a picture a camera and layer (new_pictures.py).
+it writes DIR/turn_0001_image.png and so on, a picture a camera and layer (new_pictures.py).
 """
 
 from __future__ import annotations
