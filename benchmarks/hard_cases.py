@@ -48,7 +48,7 @@ def photographed_outside(sample: Sample, given: Path) -> None:
             continue
         for k, light in enumerate(after.lights):
             path = given / after.name / f"{light:03d}.png"
-            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
             image[lost] = before.samples[before.pixel_index[lost], k, ::-1]
             cv2.imwrite(str(path), image)
 

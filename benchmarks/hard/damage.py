@@ -95,7 +95,8 @@ def one_foreign(capture: Capture, _: float, rng: np.random.Generator) -> Capture
     alone = replace(
         other, cameras=(camera,), lights=replace(other.lights, direction=other.lights.direction[1:], intensity=other.lights.intensity[1:])
     )
-    (mask,), (radiance,), _ = photograph_scene(alone)
+    masks, radiances, _others = photograph_scene(alone)
+    (mask,), (radiance,) = masks, radiances
     light = int(rng.integers(len(view.lights)))
     image = np.zeros((*mask.shape, 3))
     image[mask] = radiance[:, light] / np.quantile(radiance, 0.999)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -121,7 +122,7 @@ def shaped_as(surface: Surface, settings: SceneSettings = BASE) -> Scene:
 
 def surface_of(*parts: trimesh.Trimesh) -> Surface:
     """Parts that may overlap as one surface, centred and scaled into the unit ball; edges of 0.03 (2 pixels of BASE) at most."""
-    whole = trimesh.util.concatenate([part.subdivide_to_size(0.03, max_iter=20) for part in parts])
+    whole: Any = trimesh.util.concatenate([part.subdivide_to_size(0.03, max_iter=20) for part in parts])
     middle = whole.bounds.mean(0)
     radius = np.linalg.norm(whole.vertices - middle, axis=-1).max()
     return Surface((whole.vertices - middle) / radius, whole.faces)
