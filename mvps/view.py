@@ -1,15 +1,18 @@
 """python -m mvps.view RESULT: a page in the browser with the model, to turn and to light, with exact shadows.
 
 The page is the viewer of viewer/ served from this machine alone; for every light that the mouse asks for, Embree traces which vertices it
-reaches. With --capture the photographs stand beside: one is chosen, and the model takes its camera and its light.
+reaches, and so for the lights that stand for an environment: one of viewer/environments.py, or a file (--envmap). With --capture the
+photographs stand beside: one is chosen, and the model takes its camera and its light.
 """
 
 from __future__ import annotations
 
 from argparse import SUPPRESS
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, urlsplit
 
@@ -17,34 +20,45 @@ from mvps.command import parse, parser, run
 from mvps.scene import CaptureError
 
 if TYPE_CHECKING:
-    from mvps.scene import Capture, Reconstruction
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mvps.scene import Bool, Capture, Float, Reconstruction
 
 Answer = tuple[str, bytes]
 """A type of content, and the content."""
 
+ENVIRONMENT_LIGHTS = 32
+"""Directional lights that stand for an environment: as many as a number of the graphics processor has bits."""
+
 
 class Model:
-    """What the server knows: the page, shadows, photographs."""
+    """What the server knows: the page, shadows, environments, photographs."""
 
-    def __init__(self, result: Reconstruction, capture: Capture | None) -> None:
+    def __init__(
+        self, result: Reconstruction, capture: Capture | None, environments: Mapping[str, NDArray[np.float32]] = MappingProxyType({})
+    ) -> None:
+        """environments: pictures (height, width, 3) by names, beside those of viewer/environments.py."""
+        import numpy as np
+
+        from mvps.viewer.environments import MADE, made
         from mvps.visibility import ray_caster
 
-        self._result, self._capture = result, capture
+        self._result = result
         self._caster = ray_caster(result.surface)
         self._views = {} if capture is None else {view.name: view for view in capture.views if view.name in result.views}
+        self._environments = {name: made(name) for name in MADE} | dict(environments)
+        self._towards, self._up = np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0])
+        if self._views:
+            first = next(iter(self._views.values())).camera
+            self._towards, self._up = -first.rotation[2], -first.rotation[1]
 
     def page(self, _: str) -> Answer:
         """The viewer, with a list of photographs where there is a capture."""
-        import numpy as np
-
         from mvps.report.page import STYLE as PAGE_STYLE
         from mvps.viewer import STYLE, viewer_html
 
-        towards, up = np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0])
-        if self._views:
-            first = next(iter(self._views.values())).camera
-            towards, up = -first.rotation[2], -first.rotation[1]
-        part = viewer_html(self._result.surface, self._result.material, up, towards, served=True)
+        part = viewer_html(self._result.surface, self._result.material, self._up, self._towards, True, tuple(self._environments))
         body = f"{part}\n{self._photographs()}"
         head = (
             f'<head><meta charset="utf-8"><link rel="icon" href="data:,"><title>mvps.view</title><style>{PAGE_STYLE}{STYLE}</style></head>'
@@ -79,17 +93,35 @@ class Model:
         """A byte per vertex, 255 where the light of ?light=x,y,z reaches it. CaptureError where that is no direction."""
         import numpy as np
 
-        from mvps.visibility import shadows
-
         try:
             light = np.array([float(word) for word in parse_qs(query)["light"][0].split(",")])
         except (KeyError, ValueError):
             light = np.zeros(0)
         if light.shape != (3,) or not np.isfinite(light).all() or not light.any():
             raise CaptureError(f"light: wanted three numbers, given {query!r}")
-        surface = self._result.surface
-        hidden = shadows(self._caster, surface.vertices, self._caster.vertex_normals, light[None] / np.linalg.norm(light))[:, 0]
-        return "application/octet-stream", np.where(hidden, 0, 255).astype(np.uint8).tobytes()
+        return "application/octet-stream", np.where(self._hidden(light[None] / np.linalg.norm(light))[:, 0], 0, 255).astype("u1").tobytes()
+
+    def _hidden(self, lights: Float) -> Bool:
+        """(V, lights) whether the mesh hides a light from a vertex."""
+        from mvps.visibility import shadows
+
+        return shadows(self._caster, self._result.surface.vertices, self._caster.vertex_normals, lights)
+
+    def environment(self, query: str) -> Answer:
+        """Of ?of=studio&turn=30 the lights that stand for the environment, turned by so many degrees: float32 (lights, 6) direction and
+        colour; then uint32 (V,), of each vertex the bits of the lights that reach it. CaptureError where there is no such environment."""
+        import numpy as np
+
+        from mvps.illumination import environment_lights
+
+        asked = parse_qs(query)
+        name, turn = (asked.get("of") or [""])[0], (asked.get("turn") or ["0"])[0]
+        if name not in self._environments or not turn.removeprefix("-").isdecimal():
+            raise CaptureError(f"of: wanted one of {', '.join(self._environments)} and a turn in whole degrees, given {query!r}")
+        light = environment_lights(self._environments[name], ENVIRONMENT_LIGHTS, self._up, int(turn) % 360)
+        lights = np.concatenate([light.direction, light.intensity], 1).astype("<f4")
+        reached = ~self._hidden(light.direction) @ (1 << np.arange(len(lights), dtype=np.uint32))
+        return "application/octet-stream", lights.tobytes() + reached.astype("<u4").tobytes()
 
     def photograph(self, query: str) -> Answer:
         """A photograph, ?of=view_04/7, as a JPEG for the screen. CaptureError where there is none."""
@@ -110,7 +142,12 @@ class Model:
 
 def server(model: Model, port: int) -> ThreadingHTTPServer:
     """A server of the model on this machine's own address; port 0: any free one. OSError where the port is taken."""
-    pages: dict[str, Callable[[str], Answer]] = {"/": model.page, "/shadow": model.shadow, "/photograph": model.photograph}
+    pages: dict[str, Callable[[str], Answer]] = {
+        "/": model.page,
+        "/shadow": model.shadow,
+        "/environment": model.environment,
+        "/photograph": model.photograph,
+    }
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -140,6 +177,10 @@ def main(argv: Sequence[str]) -> None:
     made = parser("mvps.view", "Show a result in the browser: turn the model, move the light, with exact shadows. Ends with Ctrl-C.")
     made.add_argument("result", type=Path, metavar="RESULT", help="folder that mvps.reconstruct wrote")
     made.add_argument("--capture", type=Path, default=SUPPRESS, metavar="CAPTURE", help="folder of the photographs, to stand beside")
+    made.add_argument("--edit", type=Path, default=SUPPRESS, metavar="FILE", help="edits of the material (docs/edits.md)")
+    made.add_argument(
+        "--envmap", type=Path, action="append", default=[], metavar="FILE", help="an environment to choose, .hdr or .exr; may be repeated"
+    )
     made.add_argument("--port", type=int, default=8080, help="of the page's address; 0: any free one")
     made.add_argument("--no-browser", action="store_true", help="print the address only")
     given = parse(made, argv)
@@ -147,11 +188,16 @@ def main(argv: Sequence[str]) -> None:
         raise CaptureError(f"--port: wanted a number from 0 to 65535, given {given.port}")
     import webbrowser
 
+    from mvps.edits import edited, read_edits
     from mvps.export import read_reconstruction
-    from mvps.load import read_capture
+    from mvps.load import read_capture, read_environment
 
     result = read_reconstruction(given.result)
-    model = Model(result, read_capture(given.capture) if "capture" in given else None)
+    capture = read_capture(given.capture) if "capture" in given else None
+    if "edit" in given:
+        cameras = {} if capture is None else {view.name: view.camera for view in capture.views}
+        result = replace(result, material=edited(result.surface, result.material, read_edits(given.edit), cameras))
+    model = Model(result, capture, {path.name: read_environment(path) for path in given.envmap})
     try:
         serving = server(model, given.port)
     except OSError as error:

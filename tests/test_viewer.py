@@ -20,8 +20,10 @@ from sphere_scene import SphereScene, make_sphere
 import mvps.viewer
 from mvps.command import run
 from mvps.export import write_reconstruction
+from mvps.illumination import environment_lights
 from mvps.view import Model, main, server
 from mvps.viewer import packed, viewer_html
+from mvps.viewer.environments import MADE, made
 
 UP, FROM = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
 
@@ -37,8 +39,8 @@ def test_the_page_holds_the_model(scene: SphereScene) -> None:
     about = json.loads(re.search(r'id="viewer-about">(.*?)</script>', html)[1])  # type: ignore[index]
     data = zlib.decompress(base64.b64decode(re.search(r'id="viewer-data">(.*?)</script>', html)[1]))  # type: ignore[index]
     V, F = about["vertices"], about["faces"]
-    assert (len(r.surface.vertices), len(r.surface.faces)) == (V, F) and len(data) == 21 * V + 12 * F
-    parts = np.split(np.frombuffer(data, np.uint8), np.cumsum([6 * V, 6 * V, 3 * V, 4 * V, 2 * V]))
+    assert (len(r.surface.vertices), len(r.surface.faces)) == (V, F) and len(data) == 20 * V + 12 * F
+    parts = np.split(np.frombuffer(data, np.uint8), np.cumsum([6 * V, 6 * V, 3 * V, 4 * V, V]))
     low, high = np.array(about["low"]), np.array(about["high"])
     position = low + parts[0].view("<u2").reshape(V, 3) / 65535 * (high - low)
     np.testing.assert_allclose(position, r.surface.vertices, atol=1e-3)
@@ -66,7 +68,8 @@ def test_a_model_that_is_too_large_is_named(scene: SphereScene, monkeypatch: pyt
 
 @pytest.fixture(scope="module")
 def address(scene: SphereScene) -> Iterator[str]:
-    with server(Model(scene.reconstruction, scene.capture), 0) as serving:
+    white = np.ones((16, 32, 3), np.float32)
+    with server(Model(scene.reconstruction, scene.capture, {"white.hdr": white}), 0) as serving:
         threading.Thread(target=serving.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{serving.server_port}"
         serving.shutdown()
@@ -84,9 +87,43 @@ def test_the_server_traces_shadows(address: str, scene: SphereScene) -> None:
     assert (seen[scene.reconstruction.surface.vertices[:, 2] > 5] == 255).all()
 
 
+def test_the_server_traces_environments(address: str, scene: SphereScene) -> None:
+    """A white one makes every vertex of a convex body as bright as its albedo; a turned one shines from elsewhere."""
+    surface = scene.reconstruction.surface
+
+    def asked(words: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        answer = urlopen(f"{address}/environment?of={words}").read()
+        numbers = np.frombuffer(answer[: -4 * len(surface.vertices)], "<f4").reshape(-1, 6)
+        bits = np.frombuffer(answer[-4 * len(surface.vertices) :], "<u4")
+        return numbers[:, :3], numbers[:, 3:], (bits[:, None] >> np.arange(len(numbers))) & 1
+
+    direction, colour, reached = asked("white.hdr")
+    arriving = (np.maximum(scene.reconstruction.material.normal @ direction.T, 0) * reached) @ colour
+    assert len(direction) == 32 and np.abs(arriving - 1).max() < 0.1
+    first, turned = asked("window")[0], asked("window&turn=90")[0]
+    up = -scene.capture.views[0].camera.rotation[1]
+    assert np.allclose(first @ up, turned @ up, atol=1e-5) and np.abs(first - turned).max() > 0.5
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_environments_without_a_file(name: str) -> None:
+    """Not negative, and of mean radiance 1 over the sphere."""
+    picture = made(name)
+    lights = environment_lights(picture, 4096, UP)
+    assert picture.min() >= 0 and abs(lights.intensity.mean(1).sum() - 4) < 0.01
+
+
 @pytest.mark.parametrize(
     ("path", "code"),
-    [("/shadow?light=0,0,0", 400), ("/shadow?light=x", 400), ("/shadow", 400), ("/photograph?of=view_77/1", 400), ("/../etc/passwd", 404)],
+    [
+        ("/environment?of=nowhere", 400),
+        ("/environment?of=window&turn=x", 400),
+        ("/shadow?light=0,0,0", 400),
+        ("/shadow?light=x", 400),
+        ("/shadow", 400),
+        ("/photograph?of=view_77/1", 400),
+        ("/../etc/passwd", 404),
+    ],
 )
 def test_other_questions_are_refused(address: str, path: str, code: int) -> None:
     with pytest.raises(HTTPError) as refused:

@@ -5,13 +5,14 @@ The browser's graphics processor evaluates the same image model (shading.py) for
     radiance = sum over lights of  E * visibility * (albedo D(n . l) D(n . v) + sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0),
 
 with normal, albedo and weights interpolated between vertices. Visibility comes from who shows the page: exactly, traced by Embree for every
-vertex (mvps.view), or from a picture of depths as the light sees them (a page without a server).
+vertex (mvps.view), or from a picture of depths as each light sees them (a page without a server). An environment, which only mvps.view has,
+is up to 32 directional lights (illumination.py) whose sum is evaluated at the vertices.
 
 Data, one array after the other, compressed by deflate (RFC 1950), written in base64:
 
     position  (V, 3) uint16   over the box from low to high        normal  (V, 3) int16 over 32767
     albedo    (V, 3) uint8    square root, over `white`            weight  (V, 4) uint8 square root, over `lobe_white`, 0 beyond the lobes
-    other     (V, 2) uint8    confidence; visibility at first      faces   (F, 3) uint32
+    confidence  (V,) uint8                                         faces   (F, 3) uint32
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 import base64
 import json
 import zlib
+from collections.abc import Sequence
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -69,7 +71,7 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
         np.rint(32767 * material.normal).astype("<i2"),
         _root_bytes(material.albedo, white),
         _root_bytes(grey, lobe_white),
-        np.stack([np.rint(255 * material.confidence), np.full(len(grey), 255)], 1).astype(np.uint8),
+        np.rint(255 * material.confidence).astype(np.uint8),
         surface.faces.astype("<u4"),
     )
     about = {
@@ -87,22 +89,47 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
     return about, zlib.compress(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), 6)
 
 
-def viewer_html(surface: Surface, material: Material, up: Float, looking_from: Float, served: bool = False) -> str:
+def _options(names: Sequence[str]) -> str:
+    return "".join(f"<option>{escape(name)}</option>" for name in names)
+
+
+def _controls(environments: Sequence[str]) -> str:
+    around = ""
+    if environments:
+        around = (
+            '<label>Environment <select id="viewer-environment"><option value="">none</option>'
+            + _options(environments)
+            + "</select></label> "
+            '<label>turned <input id="viewer-turn" type="range" min="0" max="345" step="15" value="0"></label>'
+        )
+    return (
+        '<p class="viewer-controls"><label>Show <select id="viewer-layer">'
+        + _options(("image", "albedo", "highlights", "normals", "confidence"))
+        + '</select></label> <label>Drag <select id="viewer-drag"><option value="turn">turns the object</option>'
+        '<option value="light">moves the light</option></select></label>'
+        ' <label>Fill light <input id="viewer-fill" type="range" min="0" max="1" step="0.05" value="0.1"></label>'
+        ' <label>Exposure <input id="viewer-exposure" type="range" min="-2" max="3" step="0.1" value="0.5"></label></p>'
+        '<p class="viewer-controls"><label>Light <select id="viewer-light"></select></label>'
+        ' <button type="button" id="viewer-more">add</button> <button type="button" id="viewer-fewer">remove</button>'
+        ' <label>Colour <input id="viewer-colour" type="color" value="#ffffff"></label>'
+        ' <label>Strength <input id="viewer-strength" type="range" min="0" max="3" step="0.05" value="1"></label> ' + around + "</p>"
+    )
+
+
+def viewer_html(
+    surface: Surface, material: Material, up: Float, looking_from: Float, served: bool = False, environments: Sequence[str] = ()
+) -> str:
     """The part of a page; up, looking_from (3,): upwards and towards the first camera, world frame. served: visibility is asked of the
-    server that the page came from. A sentence in its place where the model is too large for a page."""
+    server that the page came from, and environments, by their names. A sentence in its place where the model is too large for a page."""
     about, data = packed(surface, material)
     if len(data) > LARGEST_BYTES and not served:
         return f"<p>The model of {len(surface.vertices):,} vertices is too large for this page; model.glb shows it.</p>"
     about |= {"up": np.asarray(up).tolist(), "from": np.asarray(looking_from).tolist(), "served": served}
-    options = "".join(f"<option>{escape(name)}</option>" for name in ("image", "albedo", "highlights", "normals", "confidence"))
     return (
         '<div class="viewer"><canvas id="viewer" tabindex="0" aria-label="The model: drag to turn it, drag with the right button or'
         ' with Shift to move the light, scroll to come closer; arrow keys turn it, with Shift they move the light"></canvas>'
-        '<p class="viewer-controls"><label>Show <select id="viewer-layer">' + options + "</select></label> "
-        '<label>Drag <select id="viewer-drag"><option value="turn">turns the object</option><option value="light">moves the light</option>'
-        '</select></label> <label>Fill light <input id="viewer-fill" type="range" min="0" max="1" step="0.05" value="0.1"></label> '
-        '<label>Exposure <input id="viewer-exposure" type="range" min="-2" max="3" step="0.1" value="0.5"></label></p>'
-        '<p id="viewer-said" role="status"></p></div>\n'
+        + _controls(environments)
+        + '<p id="viewer-said" role="status"></p></div>\n'
         f'<script type="application/json" id="viewer-about">{json.dumps(about)}</script>\n'
         f'<script type="text/plain" id="viewer-data">{base64.b64encode(data).decode("ascii")}</script>\n'
         f"<script>{program()}</script>"

@@ -1,4 +1,4 @@
-// Shows a model under light that the mouse moves. Data and image model: mvps/viewer/__init__.py.
+// Shows a model under lights that the mouse moves, and under an environment. Data and image model: mvps/viewer/__init__.py.
 "use strict";
 (async () => {
   const byId = (name) => document.getElementById(name);
@@ -14,7 +14,7 @@
   const V = about.vertices, F = about.faces;
   let at = 0;
   const take = (length) => { const part = bytes.slice(at, at + length); at += length; return part; };
-  const arrays = { position: take(6 * V), normal: take(6 * V), albedo: take(3 * V), weight: take(4 * V), other: take(2 * V), faces: take(12 * F) };
+  const arrays = { position: take(6 * V), normal: take(6 * V), albedo: take(3 * V), weight: take(4 * V), confidence: take(V), faces: take(12 * F) };
 
   // ---- small vectors and matrices (columns) ----
   const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
@@ -41,26 +41,20 @@
   const radius = Math.hypot(...about.low.map((x, i) => about.high[i] - x)) / 2;
   const up = unit(about.up);
   let from = unit(about.from), distance = 4.2 * radius;
-  let light = unit(add(add(from, up, 0.5), cross(up, from), 0.5));
+  const aside = cross(up, from);
+  const placed = [[0.5, 0.5], [0.5, -0.8], [-0.3, 0.9], [1.2, 0]].map(([high, right]) => unit(add(add(from, up, high), aside, right)));
+  // colour: linear, the strength included.
+  const lights = [{ direction: placed[0], colour: [1, 1, 1] }];
+  let chosen = 0;
 
   // ---- programs ----
-  const VERTEX = `#version 300 es
-    in vec3 position; in vec3 normal; in vec3 albedo; in vec4 weight; in vec2 other;
-    uniform vec3 low, high; uniform mat4 view;
-    out vec3 x, n, rho, seen; out vec4 w;
-    void main() {
-      x = mix(low, high, position); n = normal; rho = albedo; w = weight; seen = vec3(other, 0.0);
-      gl_Position = view * vec4(x, 1.0);
-    }`;
-  const FRAGMENT = `#version 300 es
-    precision highp float; precision highp sampler2DShadow;
-    in vec3 x, n, rho, seen; in vec4 w;
-    uniform vec3 eye, light, tint[4]; uniform vec4 sharpness, lobeWhite;
-    uniform float white, grazing, exposure, fill; uniform int layer; uniform bool microfacet, traced;
-    uniform mat4 fromLight; uniform sampler2DShadow depths;
-    out vec4 colour;
+  const MOST = 4, SKY = 32, SIDE = 2048;
+  const ATTRIBUTES = [["position", 3, gl.UNSIGNED_SHORT], ["normal", 3, gl.SHORT], ["albedo", 3, gl.UNSIGNED_BYTE],
+    ["weight", 4, gl.UNSIGNED_BYTE], ["confidence", 1, gl.UNSIGNED_BYTE], ["reached", 4, gl.UNSIGNED_BYTE]];
+  const MODEL = `
+    uniform vec3 tint[4]; uniform vec4 sharpness, lobeWhite; uniform float white, grazing; uniform int layer; uniform bool microfacet;
     float D(float c) { float g = 1.0 - max(c, 0.0); return 1.0 + grazing * g * g * g; }
-    vec3 shine(vec3 N, vec3 v, vec3 l) {
+    vec3 shine(vec4 w, vec3 N, vec3 v, vec3 l) {
       float hn = dot(normalize(v + l), N);
       vec3 sum = vec3(0.0);
       for (int k = 0; k < 4; k++) {
@@ -69,30 +63,53 @@
       }
       return sum;
     }
-    float visibility(vec3 N) {
-      if (traced) return seen.y;
-      vec4 p = fromLight * vec4(x, 1.0);
+    vec3 lit(vec3 body, vec4 w, vec3 N, vec3 v, vec3 l) {
+      vec3 matte = layer == 2 ? vec3(0.0) : body * D(dot(N, l)) * D(dot(N, v));
+      return (matte + shine(w, N, v, l)) * max(dot(N, l), 0.0);
+    }`;
+  const VERTEX = `#version 300 es
+    precision highp float; precision highp int;
+    in vec3 position; in vec3 normal; in vec3 albedo; in vec4 weight; in float confidence; in vec4 reached; in uint open;
+    uniform vec3 low, high, eye, sky[${SKY}], skyColour[${SKY}]; uniform mat4 view; uniform int around;
+    out vec3 x, n, rho, surrounding; out vec4 w, seen; out float certain;
+    ${MODEL}
+    void main() {
+      x = mix(low, high, position); n = normal; rho = albedo; w = weight; seen = reached; certain = confidence;
+      surrounding = vec3(0.0);
+      vec3 N = normalize(n), v = normalize(eye - x);
+      for (int k = 0; k < around; k++)
+        if (((open >> uint(k)) & 1u) == 1u) surrounding += skyColour[k] * lit(rho * rho * white, w, N, v, sky[k]);
+      gl_Position = view * vec4(x, 1.0);
+    }`;
+  const FRAGMENT = `#version 300 es
+    precision highp float; precision highp int; precision highp sampler2DArrayShadow;
+    in vec3 x, n, rho, surrounding; in vec4 w, seen; in float certain;
+    uniform vec3 eye, light[${MOST}], lamp[${MOST}]; uniform int lights;
+    uniform float exposure, fill; uniform bool traced; uniform mat4 fromLight[${MOST}]; uniform sampler2DArrayShadow depths;
+    out vec4 colour;
+    ${MODEL}
+    float visibility(int k) {
+      if (traced) return seen[k];
+      vec4 p = fromLight[k] * vec4(x, 1.0);
       vec3 q = p.xyz * 0.5 + 0.5;
       q.z -= 0.004;
       float sum = 0.0;
-      for (int i = -1; i <= 1; i++) for (int j = -1; j <= 1; j++) sum += texture(depths, q + vec3(i, j, 0) / 2048.0);
+      for (int i = -1; i <= 1; i++) for (int j = -1; j <= 1; j++)
+        sum += texture(depths, vec4(q.xy + vec2(i, j) / ${SIDE}.0, float(k), q.z));
       return sum / 9.0;
     }
     vec3 srgb(vec3 c) { c = clamp(c, 0.0, 1.0); return mix(12.92 * c, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, c)); }
     void main() {
       vec3 N = normalize(n), v = normalize(eye - x), body = rho * rho * white;
       if (layer == 3) { colour = vec4((N + 1.0) / 2.0, 1.0); return; }
-      if (layer == 4) { colour = vec4(vec3(seen.x), 1.0); return; }
+      if (layer == 4) { colour = vec4(vec3(certain), 1.0); return; }
       if (layer == 1) { colour = vec4(srgb(body * exposure), 1.0); return; }
-      float lit = max(dot(N, light), 0.0) * visibility(N);
-      vec3 matte = layer == 2 ? vec3(0.0) : body * D(dot(N, light)) * D(dot(N, v));
-      vec3 shown = (matte + shine(N, v, light)) * lit;
-      float lamp = max(dot(N, v), 0.0);
-      shown += fill * ((layer == 2 ? vec3(0.0) : body * D(lamp) * D(lamp)) + shine(N, v, v)) * lamp;
+      vec3 shown = surrounding + fill * lit(body, w, N, v, v);
+      for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, N, v, light[k]) * visibility(k);
       colour = vec4(srgb(shown * exposure), 1.0);
     }`;
   const DEPTH = `#version 300 es
-    precision highp float;
+    precision highp float; precision highp int;
     void main() {}`;
   const compiled = (vertex, fragment) => {
     const made = gl.createProgram();
@@ -103,7 +120,7 @@
       if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
       gl.attachShader(made, shader);
     });
-    ["position", "normal", "albedo", "weight", "other"].forEach((name, k) => gl.bindAttribLocation(made, k, name));
+    [...ATTRIBUTES.map(([name]) => name), "open"].forEach((name, k) => gl.bindAttribLocation(made, k, name));
     gl.linkProgram(made);
     if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
     return made;
@@ -114,39 +131,44 @@
   // ---- buffers ----
   const vertexArray = gl.createVertexArray();
   gl.bindVertexArray(vertexArray);
-  const buffers = [["position", 3, gl.UNSIGNED_SHORT], ["normal", 3, gl.SHORT], ["albedo", 3, gl.UNSIGNED_BYTE],
-    ["weight", 4, gl.UNSIGNED_BYTE], ["other", 2, gl.UNSIGNED_BYTE]].map(([name, size, type], k) => {
+  // Which of the lights reach a vertex, and which of an environment's, a bit each.
+  const reached = new Uint8Array(4 * V).fill(255), open = new Uint32Array(V);
+  const filled = (values, k) => {
     const buffer = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, arrays[name], gl.DYNAMIC_DRAW);
+    gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW);
     gl.enableVertexAttribArray(k);
+    return buffer;
+  };
+  const buffers = ATTRIBUTES.map(([name, size, type], k) => {
+    const buffer = filled(name === "reached" ? reached : arrays[name], k);
     gl.vertexAttribPointer(k, size, type, true, 0, 0);
     return buffer;
   });
+  const openBuffer = filled(open, ATTRIBUTES.length);
+  gl.vertexAttribIPointer(ATTRIBUTES.length, 1, gl.UNSIGNED_INT, 0, 0);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
   gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, arrays.faces, gl.STATIC_DRAW);
 
-  const SIDE = 2048;
   const depths = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, depths);
-  gl.texStorage2D(gl.TEXTURE_2D, 1, gl.DEPTH_COMPONENT24, SIDE, SIDE);
-  gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE);
-  [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER].forEach((name) => gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR));
-  [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((name) => gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE));
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, depths);
+  if (!about.served) gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, SIDE, SIDE, MOST);
+  else gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, 1, 1, 1);
+  gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE);
+  [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER].forEach((name) => gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.LINEAR));
+  [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((name) => gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.CLAMP_TO_EDGE));
   const frame = gl.createFramebuffer();
-  gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
-  gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, gl.TEXTURE_2D, depths, 0);
-  gl.bindFramebuffer(gl.FRAMEBUFFER, null);
   gl.enable(gl.DEPTH_TEST);
 
   // ---- drawing ----
+  let sky = [];
   const common = (program, view) => {
     gl.useProgram(program);
     set(program, "low", "3fv", about.low);
     set(program, "high", "3fv", about.high);
     set(program, "view", "Matrix4fv", false, view);
   };
-  const lightView = () => {
+  const lightView = (light) => {
     const helper = Math.abs(dot(light, up)) > 0.99 ? cross(up, from) : up;
     const scale = 1 / (1.02 * radius);
     const box = [scale, 0, 0, 0, 0, scale, 0, 0, 0, 0, -scale / 2, 0, 0, 0, -1, 1];
@@ -155,14 +177,17 @@
   const draw = () => {
     const across = Math.round(canvas.clientWidth * devicePixelRatio), down = Math.round(canvas.clientHeight * devicePixelRatio);
     if (canvas.width !== across || canvas.height !== down) { canvas.width = across; canvas.height = down; }
-    const lit = lightView();
+    const fromLight = lights.map((light) => lightView(light.direction));
     gl.bindVertexArray(vertexArray);
     if (!about.served) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, frame);
       gl.viewport(0, 0, SIDE, SIDE);
-      gl.clear(gl.DEPTH_BUFFER_BIT);
-      common(deep, lit);
-      gl.drawElements(gl.TRIANGLES, 3 * F, gl.UNSIGNED_INT, 0);
+      fromLight.forEach((matrix, k) => {
+        gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.DEPTH_ATTACHMENT, depths, 0, k);
+        gl.clear(gl.DEPTH_BUFFER_BIT);
+        common(deep, matrix);
+        gl.drawElements(gl.TRIANGLES, 3 * F, gl.UNSIGNED_INT, 0);
+      });
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     }
     const eye = add(centre, from, distance), near = Math.max(distance - 1.1 * radius, 0.01 * radius), far = distance + 1.1 * radius;
@@ -174,7 +199,14 @@
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     common(shown, product(lens, looking(eye, from.map((x) => -x), up)));
     set(shown, "eye", "3fv", eye);
-    set(shown, "light", "3fv", light);
+    set(shown, "light", "3fv", lights.flatMap((light) => light.direction));
+    set(shown, "lamp", "3fv", lights.flatMap((light) => light.colour));
+    set(shown, "lights", "1i", lights.length);
+    set(shown, "around", "1i", sky.length);
+    if (sky.length) {
+      set(shown, "sky", "3fv", sky.flatMap((light) => light.slice(0, 3)));
+      set(shown, "skyColour", "3fv", sky.flatMap((light) => light.slice(3)));
+    }
     set(shown, "tint", "3fv", about.tint.flat());
     set(shown, "sharpness", "4fv", about.sharpness);
     set(shown, "lobeWhite", "4fv", about.lobe_white);
@@ -185,7 +217,7 @@
     set(shown, "layer", "1i", byId("viewer-layer").selectedIndex);
     set(shown, "microfacet", "1i", about.microfacet ? 1 : 0);
     set(shown, "traced", "1i", about.served ? 1 : 0);
-    set(shown, "fromLight", "Matrix4fv", false, lit);
+    set(shown, "fromLight", "Matrix4fv", false, fromLight.flat());
     set(shown, "depths", "1i", 0);
     gl.drawElements(gl.TRIANGLES, 3 * F, gl.UNSIGNED_INT, 0);
     canvas.dataset.drawn = String(Number(canvas.dataset.drawn || 0) + 1);
@@ -197,22 +229,51 @@
     requestAnimationFrame(() => { waiting = false; draw(); });
   };
 
-  // ---- exact shadows, from the server ----
-  const other = new Uint8Array(arrays.other);
-  let asking = false, again = false;
-  const ask = async () => {
+  // ---- exact shadows and environments, from the server ----
+  const words = (values) => values.map((x) => x.toFixed(6)).join(",");
+  const bytesOf = async (address) => {
+    const answer = await fetch(address);
+    if (!answer.ok) throw new Error(answer.statusText);
+    return answer.arrayBuffer();
+  };
+  const stale = new Set();
+  let asking = false;
+  const ask = async (k) => {
     if (!about.served) return;
-    if (asking) { again = true; return; }
+    stale.add(k);
+    if (asking) return;
     asking = true;
-    const answer = await fetch("shadow?light=" + light.map((x) => x.toFixed(6)).join(","));
-    const seen = new Uint8Array(await answer.arrayBuffer());
-    for (let i = 0; i < V; i++) other[2 * i + 1] = seen[i];
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[4]);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, other);
-    canvas.dataset.traced = String(Number(canvas.dataset.traced || 0) + 1);
-    asking = false;
+    try {
+      while (stale.size) {
+        const next = Math.min(...stale);
+        stale.delete(next);
+        if (next >= lights.length) continue;
+        const seen = new Uint8Array(await bytesOf("shadow?light=" + words(lights[next].direction)));
+        for (let i = 0; i < V; i++) reached[4 * i + next] = seen[i];
+        gl.bindBuffer(gl.ARRAY_BUFFER, buffers[5]);
+        gl.bufferSubData(gl.ARRAY_BUFFER, 0, reached);
+        canvas.dataset.traced = String(Number(canvas.dataset.traced || 0) + 1);
+        later();
+      }
+    } finally { asking = false; }
+  };
+  let surrounding = 0;
+  const surround = async () => {
+    const mine = ++surrounding, name = byId("viewer-environment").value, turn = byId("viewer-turn").value;
+    let found = [], bits = new Uint32Array(V);
+    if (name) {
+      const answer = await bytesOf("environment?of=" + encodeURIComponent(name) + "&turn=" + turn);
+      const numbers = new Float32Array(answer.slice(0, answer.byteLength - 4 * V));
+      found = Array.from({ length: numbers.length / 6 }, (_, k) => Array.from(numbers.slice(6 * k, 6 * k + 6)));
+      bits = new Uint32Array(answer.slice(answer.byteLength - 4 * V));
+    }
+    // A later choice may have been answered first.
+    if (mine !== surrounding) return;
+    sky = found;
+    gl.bindBuffer(gl.ARRAY_BUFFER, openBuffer);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, bits);
+    canvas.dataset.surrounded = String(Number(canvas.dataset.surrounded || 0) + 1);
     later();
-    if (again) { again = false; ask(); }
   };
 
   // ---- hands ----
@@ -220,8 +281,8 @@
     const right = unit(cross(up, from));
     if (ofLight) {
       const above = cross(from, right);
-      light = unit(turned(turned(light, above, x), right, y));
-      ask();
+      lights[chosen].direction = unit(turned(turned(lights[chosen].direction, above, x), right, y));
+      ask(chosen).catch(failed);
     } else {
       from = turned(from, up, -x);
       const lifted = turned(from, unit(cross(up, from)), -y);
@@ -252,8 +313,46 @@
     if (step) { e.preventDefault(); move(step[0], step[1], e.shiftKey); }
   });
   ["viewer-layer", "viewer-fill", "viewer-exposure"].forEach((name) => byId(name).addEventListener("input", later));
+
+  // ---- lights ----
+  const list = byId("viewer-light"), tone = byId("viewer-colour"), strength = byId("viewer-strength");
+  const listed = () => {
+    list.replaceChildren(...lights.map((_, k) => new Option(String(k + 1), String(k), k === chosen, k === chosen)));
+    byId("viewer-more").disabled = lights.length === MOST;
+    byId("viewer-fewer").disabled = lights.length === 1;
+    tone.value = lights[chosen].tone || "#ffffff";
+    strength.value = String(lights[chosen].strength ?? 1);
+  };
+  const coloured = () => {
+    const one = lights[chosen];
+    [one.tone, one.strength] = [tone.value, Number(strength.value)];
+    const code = [1, 3, 5].map((k) => parseInt(tone.value.slice(k, k + 2), 16) / 255);
+    one.colour = code.map((c) => one.strength * (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4));
+    later();
+  };
+  list.addEventListener("input", () => { chosen = Number(list.value); listed(); });
+  byId("viewer-more").addEventListener("click", () => {
+    chosen = lights.push({ direction: placed[lights.length], colour: [1, 1, 1] }) - 1;
+    listed();
+    ask(chosen).catch(failed);
+    later();
+  });
+  byId("viewer-fewer").addEventListener("click", () => {
+    lights.splice(chosen, 1);
+    chosen = Math.min(chosen, lights.length - 1);
+    listed();
+    lights.forEach((_, k) => ask(k).catch(failed));
+    later();
+  });
+  [tone, strength].forEach((control) => control.addEventListener("input", coloured));
+  listed();
+  const failed = (error) => { said.textContent = "The viewer failed: " + error.message; };
+  ["viewer-environment", "viewer-turn"].forEach((name) => byId(name)?.addEventListener("change", () => surround().catch(failed)));
   new ResizeObserver(later).observe(canvas);
-  window.mvpsViewer = { look: (direction) => { from = unit(direction); later(); }, lightFrom: (direction) => { light = unit(direction); ask(); later(); } };
-  ask();
+  window.mvpsViewer = {
+    look: (direction) => { from = unit(direction); later(); },
+    lightFrom: (direction) => { lights[chosen].direction = unit(direction); ask(chosen).catch(failed); later(); },
+  };
+  ask(0).catch(failed);
   later();
 })().catch((error) => { document.getElementById("viewer-said").textContent = "The viewer failed: " + error.message; console.error(error); });
