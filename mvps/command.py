@@ -1,6 +1,7 @@
 """What every command line of the program shares: options, exit codes and the one sentence for bad input.
 
-exit code   0 done,  2 bad input (one sentence on standard error),  130 interrupted,  141 the reader of a pipe went away
+exit code   0 done,  2 bad input (one sentence on standard error),  129, 130, 143 ended by a signal (the terminal closed, Ctrl-C, kill),
+            141 the reader of a pipe went away
 """
 
 from __future__ import annotations
@@ -12,8 +13,11 @@ import io
 import logging
 import math
 import os
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NoReturn
 
@@ -63,6 +67,28 @@ def parse(made: Parser, argv: Sequence[str]) -> argparse.Namespace:
     return arguments
 
 
+class _Ended(KeyboardInterrupt):
+    """By a signal whose number is its first argument, and like Ctrl-C: nothing half-written stays."""
+
+
+@contextmanager
+def _signals() -> Iterator[None]:
+    """While a command runs, a request to end is an exception. Where a caller has his own way with a signal, that stays."""
+    mine = threading.current_thread() is threading.main_thread()
+    asked = [number for number in (signal.SIGTERM, signal.SIGHUP) if mine and signal.getsignal(number) is signal.SIG_DFL]
+
+    def end(number: int, _: object) -> NoReturn:
+        raise _Ended(number)
+
+    for number in asked:
+        signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)
+
+
 def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:
     """Run a command with these arguments (None: those of the process) and return its exit code."""
     keep_freed()
@@ -70,8 +96,9 @@ def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        main(sys.argv[1:] if argv is None else argv)
-        sys.stdout.flush()
+        with _signals():
+            main(sys.argv[1:] if argv is None else argv)
+            sys.stdout.flush()
     except CaptureError as error:
         return _complain(str(error))
     except ValueError as error:
@@ -88,9 +115,9 @@ def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None
         if not sentence:
             raise
         return _complain(sentence)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as error:
         print("mvps: interrupted before the end", file=sys.stderr)
-        return 130
+        return 128 + (error.args[0] if isinstance(error, _Ended) else signal.SIGINT)
     finally:
         # The process ends and takes its memory along: no search for garbage among the libraries' half a million objects.
         gc.freeze()

@@ -197,8 +197,11 @@ def test_capture_and_result_whose_names_are_no_text(capture: Path, tmp_path: Pat
 # ------------------------------------------------------------------------------------------------ interruptions
 
 
-@pytest.mark.parametrize("stage", ["load", "joint refinement"])
-def test_an_interrupted_run(capture: Path, tmp_path: Path, stage: str) -> None:
+@pytest.mark.parametrize(
+    ("stage", "number"),
+    [("load", signal.SIGINT), ("joint refinement", signal.SIGINT), ("joint refinement", signal.SIGTERM), ("textures", signal.SIGHUP)],
+)
+def test_an_interrupted_run(capture: Path, tmp_path: Path, stage: str, number: signal.Signals) -> None:
     out = tmp_path / "out"
     command = [sys.executable, "-m", "mvps.reconstruct", str(capture), "--out", str(out), "--preset", "draft"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
@@ -207,9 +210,9 @@ def test_an_interrupted_run(capture: Path, tmp_path: Path, stage: str) -> None:
             if line.startswith(f"{stage} ..."):
                 break
         time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         rest = process.stderr.read().splitlines()
-        assert process.wait(timeout=60) == 130
+        assert process.wait(timeout=60) == 128 + number
     assert rest[-1] == "mvps: interrupted before the end" and not any("Traceback" in line for line in rest)
     assert not [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
     assert not out.exists() or [path.name for path in out.iterdir()] == ["checkpoint"]
