@@ -3,9 +3,10 @@
     GLB = header, JSON chunk (padded with spaces), binary chunk (padded with zeros), all little-endian and on 4-byte borders.
 
 Attributes POSITION, NORMAL (mesh normals), TANGENT (w = 1: bitangent = normal x tangent) and TEXCOORD_0. The specular
-reflection at normal incidence F0 goes into KHR_materials_specular: F0 = 0.04 specularColorFactor specularColorTexture.
+reflection at normal incidence F0 goes into KHR_materials_specular: F0 = 0.04 specularColorFactor specularColorTexture; glTF dims the
+base colour by 1 - max F, for which it is divided by 1 - max F0 beforehand.
 glTF's unit is the metre and its up axis is y; a capture has neither, so coordinates are kept as they are, and the
-material's extras say by what albedo was divided.
+material's extras say how albedo follows from the base colour.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def _material(textures: Textures) -> dict[str, Any]:
         },
         "normalTexture": {"index": 1},
         "extensions": {"KHR_materials_specular": specular},
-        "extras": {"albedo_scale": textures.scale, "albedo": "albedo = albedo_scale * base colour (linear)"},
+        "extras": {"albedo_scale": textures.scale, "albedo": "albedo = albedo_scale * base colour (linear) * (1 - max F0)"},
     }
 
 

@@ -28,7 +28,7 @@ from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tan
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
 from mvps.cores import one_by_one
 from mvps.mesh import face_areas, lengths, normalise, vertex_normals
-from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
+from mvps.pbr import glossy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, Surface, View
 from mvps.visibility import RayCaster, ray_caster
@@ -43,13 +43,16 @@ REWEIGHTINGS = 4
 STEEPEST_VIEW = 0.2
 """Smallest cosine between normal and view direction: beyond, one pixel spreads over more than five texels."""
 
+LEAST_ENTERING = 1e-3
+"""Smallest share of light that enters the body: where F0 is 1, nothing is left for a base colour to return."""
+
 
 @dataclass(frozen=True, eq=False)
 class Textures:
     """An atlas with its pictures, each (height, width) of the atlas.
 
     mesh_normal       (V, 3) unit vertex normals that the normal map is relative to
-    base_color        (h, w, 3) uint8 sRGB of albedo / scale, with the scale of mvps.pbr for the texels
+    base_color        (h, w, 3) uint8 sRGB of albedo / (scale (1 - max F0)), with the scale of mvps.pbr for the texels
     normal_map        (h, w, 3) uint8;  roughness (h, w) uint8, linear
     specular_color    (h, w, 3) uint8 sRGB of F0 / specular_level, the largest F0 (mvps.pbr)
     from_photographs  share of texels that a view saw
@@ -81,17 +84,18 @@ def bake(surface: Surface, material: Material, lights: Lights, capture: Capture,
     albedo, seen = _photographed_albedo(surface, material, lights, capture, position, normalise(normal))
     albedo = np.where(seen[:, None], albedo, _at(texels, surface, material.albedo))
     weight = _at(texels, surface, material.specular_weight)
-    specular = specular_energy(weight, material.sharpness)
-    scale = white_level(albedo + specular)
-    specular /= scale
+    rough, specular = glossy(weight, material.law)
+    scale = white_level(albedo + specular.max(1, keepdims=True))
+    specular = np.minimum(specular / scale, 1)
+    entering = np.maximum(1 - specular.max(1, keepdims=True), LEAST_ENTERING)
     level = min(white_level(specular), 1.0) if (specular > 0).any() else 0.0
     shading = _tangent_space(atlas, texels, mesh_normal, _at(texels, surface, material.normal))
     return Textures(
         atlas=atlas,
         mesh_normal=mesh_normal,
-        base_color=_picture(atlas, texels, srgb_bytes(albedo / scale)),
+        base_color=_picture(atlas, texels, srgb_bytes(albedo / (scale * entering))),
         normal_map=_picture(atlas, texels, np.rint((shading + 1) * 127.5).astype(np.uint8)),
-        roughness=_picture(atlas, texels, np.rint(roughness(weight, material.sharpness) * 255).astype(np.uint8)),
+        roughness=_picture(atlas, texels, np.rint(rough * 255).astype(np.uint8)),
         specular_color=_picture(atlas, texels, srgb_bytes(specular / (level or 1.0))),
         specular_level=level,
         scale=scale,
