@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from mvps.atlas import vertex_tangents
 from mvps.mesh import normalise
-from mvps.scene import Float
 from mvps.texture import Textures
 
 DIELECTRIC = 0.04
@@ -36,8 +35,8 @@ def metallic_roughness(textures: Textures) -> NDArray[np.uint8]:
     return np.stack([zero, textures.roughness, zero], -1)
 
 
-def glb_bytes(vertices: Float, textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
-    """The surface's vertices (V, 3) with their textures as a GLB file.
+def glb_bytes(textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
+    """A surface with its textures as a GLB file.
 
     pictures: base_color, normal, metallic_roughness and specular as PNG files, in this order.
     """
@@ -45,7 +44,7 @@ def glb_bytes(vertices: Float, textures: Textures, pictures: Mapping[str, bytes]
     normal = normalise(textures.mesh_normal)
     tangent = vertex_tangents(atlas, normal)
     arrays = {
-        "POSITION": vertices[atlas.vertex],
+        "POSITION": textures.surface.vertices[atlas.vertex],
         "NORMAL": normal[atlas.vertex],
         "TANGENT": np.concatenate([tangent, np.ones((len(tangent), 1))], 1),
         "TEXCOORD_0": atlas.uv,

@@ -29,9 +29,9 @@ from mvps.shading import lobes_of
 
 BRIGHTEST = 99.9
 """Percentile of the reflectance that becomes 1: one vertex in a thousand may be an outlier and is clipped."""
-SMOOTHEST, ALPHAS = 1e-2, 128
+SMOOTHEST, ALPHAS = 1e-2, 64
 """Smallest alpha: half of a sharper lobe (s over 20000) lies within half a degree, less than normals are known to; and how many are tried,
-at equal ratios: two steps of 8 bit of roughness apart."""
+at equal ratios, from half the alpha of the sharpest lobe to twice that of the widest."""
 SPREAD = np.radians(50)
 """Largest angle between light and view: photometric stereo's lights surround the camera."""
 STEEPEST = np.radians(75)
@@ -48,30 +48,32 @@ def specular_energy(specular_weight: Float, sharpness: Float) -> Float:
 
 def glossy(specular_weight: Float, law: Law) -> tuple[Float, Float]:
     """(n,) roughness of glTF in [0, 1], 1 where there is no specular reflection, and (n, 3) g F0, from weights (n, lobes[, 3]) of a law."""
-    weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None].repeat(3, -1)
+    weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None]
     rough, reflected = np.ones(len(weight)), np.zeros((len(weight), 3))
     shining = np.flatnonzero(weight.any((1, 2)))
     if len(shining):
         alpha, alike, length = _alike(law)
     for start in range(0, len(shining), ROWS_PER_CHUNK):
         part = shining[start : start + ROWS_PER_CHUNK]
-        best = (weight[part].mean(-1).astype(np.float32) @ alike.astype(np.float32)).argmax(1)
+        of_part = weight[part].astype(np.float32)
+        best = (of_part.mean(-1) @ alike).argmax(1)
         rough[part] = np.sqrt(alpha[best])
-        reflected[part] = np.einsum("nkc,kn->nc", weight[part], alike[:, best] / length[best])
+        reflected[part] = np.einsum("nkc,nk->nc", of_part, (alike / length).T[best])
     return rough, reflected
 
 
 @lru_cache(maxsize=8)
-def _alike(law: Law) -> tuple[Float, Float, Float]:
+def _alike(law: Law) -> tuple[Float, NDArray[np.float32], NDArray[np.float32]]:
     """alpha (ALPHAS,) that are tried; M (lobes, ALPHAS); |pi D V| (ALPHAS,)."""
     n_dot_l, n_dot_v, h_dot_n, share = _directions()
-    alpha = np.geomspace(SMOOTHEST, 1, ALPHAS)
+    widest, sharpest = (np.sqrt(2 / s) for s in (min(law.sharpness), max(law.sharpness)))
+    alpha = np.geomspace(np.clip(sharpest / 2, SMOOTHEST, 1), np.clip(2 * widest, SMOOTHEST, 1), ALPHAS)
     ours = lobes_of(h_dot_n, law) * (share * n_dot_l)[:, None]
     square = alpha**2
     smith = [x[:, None] + np.sqrt(square + (1 - square) * x[:, None] ** 2) for x in (n_dot_l, n_dot_v)]
     ggx = square / (h_dot_n[:, None] ** 2 * (square - 1) + 1) ** 2 / (smith[0] * smith[1]) * (share * n_dot_l)[:, None]
     length = np.linalg.norm(ggx, axis=0)
-    return alpha, ours.T @ ggx / length, length
+    return alpha, (ours.T @ ggx / length).astype(np.float32), length.astype(np.float32)
 
 
 def _directions() -> tuple[Float, Float, Float, Float]:

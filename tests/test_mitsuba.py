@@ -48,7 +48,7 @@ MISTAKES: dict[str, Callable[[Any], Any]] = {
 def test_mitsuba_shows_the_file_as_we_render_it(scene: SphereScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     r = scene.reconstruction
-    write_reconstruction(r, tmp_path / "result", bake(r.surface, r.material, r.lights, scene.capture, 2))
+    write_reconstruction(r, tmp_path / "result", bake(r.surface, r.material, r.lights, scene.capture, 2)[0])
     assert gap(scene, tmp_path / "result") > BAR + 5
     for name, mistake in MISTAKES.items():
         assert gap(scene, tmp_path / "result", mistake) < BAR, name
@@ -63,6 +63,6 @@ def test_the_files_tangents_are_those_of_its_texture_coordinates(
     from glb import read_glb, tangent_gap_deg
 
     r = scene.reconstruction
-    write_reconstruction(r, tmp_path / "result", bake(r.surface, r.material, r.lights, scene.capture, 2))
+    write_reconstruction(r, tmp_path / "result", bake(r.surface, r.material, r.lights, scene.capture, 2)[0])
     found = tangent_gap_deg(read_glb(tmp_path / "result" / "model.glb"))
     assert found.mean() < 1.5 and np.percentile(found, 99) < 5

@@ -16,7 +16,7 @@ from sphere_scene import RADIUS, SphereScene, colours, make_sphere
 
 from mvps.atlas import AXES, PADDING, STEEPEST, Atlas, build_atlas, padded, rasterise, vertex_tangents
 from mvps.gltf import glb_bytes, metallic_roughness
-from mvps.mesh import face_areas, face_normals, normalise, vertex_normals
+from mvps.mesh import decimated, face_areas, face_normals, nearest, normalise, vertex_normals
 from mvps.pbr import glossy, reflectance_scale, specular_energy, srgb_bytes
 from mvps.rendering import photograph
 from mvps.scene import Capture, Law, Lights, Material, Surface, View
@@ -279,7 +279,7 @@ def baked(scene: SphereScene) -> Textures:
     """From a material whose albedo is grey: the colours can only come from the photographs."""
     r = scene.reconstruction
     grey = replace(r.material, albedo=np.full_like(r.material.albedo, 0.6))
-    return bake(r.surface, grey, r.lights, scene.capture, 2)
+    return bake(r.surface, grey, r.lights, scene.capture, 2)[0]
 
 
 def albedo_of(textures: Textures) -> np.ndarray:
@@ -309,7 +309,7 @@ def test_texels_without_a_photograph_keep_the_vertices_albedo(scene: SphereScene
     one = Capture("one", scene.capture.views[:1])
     lights = Lights(r.lights.direction[:1], r.lights.intensity[:1], True)
     grey = replace(r.material, albedo=np.full_like(r.material.albedo, 0.6))
-    textures = bake(r.surface, grey, lights, one, 2)
+    textures = bake(r.surface, grey, lights, one, 2)[0]
     row, column, position = texel_positions(scene, textures.atlas)
     colour = albedo_of(textures)[row, column]
     np.testing.assert_allclose(colour[position[:, 0] < 0], 0.6, atol=0.01)
@@ -337,7 +337,7 @@ def test_a_hidden_part_takes_no_colour_from_what_hides_it() -> None:
     radiance = photograph(RayCaster(surface), material, view.camera, view.pixels, lights.direction[0], lights.intensity[0])
     samples = np.rint(radiance / 2 * 65535).astype(np.uint16)
     wrong = replace(material, albedo=np.full_like(albedo, 0.1))
-    textures = bake(surface, wrong, lights, Capture("two", (replace(view, samples=samples),)), 2)
+    textures = bake(surface, wrong, lights, Capture("two", (replace(view, samples=samples),)), 2)[0]
     t = rasterise(textures.atlas.uv, textures.atlas.faces, textures.atlas.height, textures.atlas.width)
     x = (surface.vertices[surface.faces[t.face]] * t.barycentric[..., None]).sum(1)
     colour = albedo_of(textures)[t.row, t.column].mean(1)
@@ -350,14 +350,14 @@ def test_a_hidden_part_takes_no_colour_from_what_hides_it() -> None:
     assert np.median(np.abs(colour[beside] - 0.6)) < 0.02 and np.median(np.abs(colour[front] - 0.3)) < 0.02
 
 
-def glb_of(surface: Surface, textures: Textures) -> bytes:
+def glb_of(textures: Textures) -> bytes:
     pictures = {
         "base_color": textures.base_color,
         "normal": textures.normal_map,
         "metallic_roughness": metallic_roughness(textures),
         "specular": textures.specular_color,
     }
-    return glb_bytes(surface.vertices, textures, {name: png_bytes(picture) for name, picture in pictures.items()})
+    return glb_bytes(textures, {name: png_bytes(picture) for name, picture in pictures.items()})
 
 
 def glb_parts(data: bytes) -> tuple[dict[str, object], dict[str, np.ndarray]]:
@@ -379,16 +379,40 @@ def glb_parts(data: bytes) -> tuple[dict[str, object], dict[str, np.ndarray]]:
     return document, arrays
 
 
-def test_normal_map_decodes_to_the_refined_normals(scene: SphereScene, baked: Textures) -> None:
-    """As a viewer does it, from the GLB alone: interpolate NORMAL and TANGENT, bitangent = cross(n, t) w, decode 2 c / 255 - 1."""
-    surface = scene.reconstruction.surface
-    _, arrays = glb_parts(glb_of(surface, baked))
+def shown_by_a_viewer(textures: Textures) -> tuple[np.ndarray, ...]:
+    """Row, column, position, mesh normal, decoded normal of texels, from the GLB alone: interpolate NORMAL and TANGENT, bitangent
+    = cross(n, t) w, decode 2 c / 255 - 1."""
+    _, arrays = glb_parts(glb_of(textures))
     faces = arrays["indices"].reshape(-1, 3).astype(int)
-    t = rasterise(arrays["TEXCOORD_0"].astype(float), faces, baked.atlas.height, baked.atlas.width)
-    n, tangent = (normalise((arrays[k][faces[t.face], :3].astype(float) * t.barycentric[..., None]).sum(1)) for k in ("NORMAL", "TANGENT"))
+    t = rasterise(arrays["TEXCOORD_0"].astype(float), faces, textures.atlas.height, textures.atlas.width)
     assert (arrays["TANGENT"][:, 3] == 1).all()
-    x, y, z = np.moveaxis(baked.normal_map[t.row, t.column] / 127.5 - 1, -1, 0)[..., None]
-    decoded = normalise(x * tangent + y * normalise(np.cross(n, tangent)) + z * n)
+    attributes = [arrays[k][faces[t.face], :3].astype(float) for k in ("POSITION", "NORMAL", "TANGENT")]
+    position, n, tangent = ((a * t.barycentric[..., None]).sum(1) for a in attributes)
+    n, tangent = normalise(n), normalise(tangent)
+    x, y, z = np.moveaxis(textures.normal_map[t.row, t.column] / 127.5 - 1, -1, 0)[..., None]
+    return t.row, t.column, position, n, normalise(x * tangent + y * normalise(np.cross(n, tangent)) + z * n)
+
+
+def test_a_shell_shows_the_full_surface_by_its_pictures(scene: SphereScene) -> None:
+    """A twentieth of the faces: normals and colours of the nearest points of the full sphere, at its exposure."""
+    r = scene.reconstruction
+    shell = decimated(r.surface, len(r.surface.faces) // 20)
+    full, level = bake(r.surface, r.material, r.lights, scene.capture, 2, [shell])
+    assert len(level.surface.faces) <= len(r.surface.faces) // 20 and level.scale == full.scale
+    row, column, position, n, decoded = shown_by_a_viewer(level)
+    found = nearest(r.surface, position)
+    expected = normalise(np.einsum("nk,nkc->nc", found.barycentric, r.material.normal[r.surface.faces[found.face]]))
+    angle, plain = (np.degrees(np.arccos(np.clip((a * expected).sum(1), -1, 1))) for a in (decoded, n))
+    assert np.percentile(angle, 99) < 1 and plain.max() > 5
+    clear = np.abs(found.point[:, 0]) > 2.5
+    error = np.abs(albedo_of(level)[row, column] - colours(found.point))[clear].max(1)
+    assert np.median(error) < 0.01 and np.percentile(error, 99) < 0.05
+
+
+def test_normal_map_decodes_to_the_refined_normals(scene: SphereScene, baked: Textures) -> None:
+    surface = scene.reconstruction.surface
+    _, _, _, n, decoded = shown_by_a_viewer(baked)
+    t = rasterise(baked.atlas.uv, baked.atlas.faces, baked.atlas.height, baked.atlas.width)
     expected = normalise((scene.reconstruction.material.normal[surface.faces[t.face]] * t.barycentric[..., None]).sum(1))
     angle = np.degrees(np.arccos(np.clip((decoded * expected).sum(1), -1, 1)))
     assert angle.max() < 1
@@ -403,7 +427,7 @@ def test_roughness_and_specular_textures(scene: SphereScene, baked: Textures) ->
     np.testing.assert_allclose(baked.roughness[row, column] / 255, expected[0], atol=0.5 / 255)
     f0 = linear_from_srgb(baked.specular_color[row, column]) * baked.specular_level
     assert np.abs(f0 / (reflected / baked.scale) - 1).max() < 0.01
-    document, _ = glb_parts(glb_of(scene.reconstruction.surface, baked))
+    document, _ = glb_parts(glb_of(baked))
     extension = document["materials"][0]["extensions"]["KHR_materials_specular"]  # type: ignore[index]
     assert extension["specularColorFactor"][0] * 0.04 == pytest.approx(baked.specular_level)
 
@@ -412,8 +436,8 @@ def test_a_matt_surface_says_so(scene: SphereScene) -> None:
     r = scene.reconstruction
     n = len(r.material.albedo)
     matt = replace(r.material, specular_weight=np.zeros((n, 0)), sharpness=np.zeros(0))
-    textures = bake(r.surface, matt, r.lights, scene.capture, 2)
-    document, _ = glb_parts(glb_of(r.surface, textures))
+    textures = bake(r.surface, matt, r.lights, scene.capture, 2)[0]
+    document, _ = glb_parts(glb_of(textures))
     material = document["materials"][0]  # type: ignore[index]
     assert material["extensions"]["KHR_materials_specular"] == {"specularFactor": 0.0}
     assert material["extras"]["albedo_scale"] == textures.scale
