@@ -50,13 +50,13 @@ class Atlas:
     """A surface cut into charts.
 
     uv (T, 2) in [0, 1]; vertex (T,) the surface's vertex of every one; faces (F, 3) of these, in the order of the
-    surface's faces; tangent (T, 3) unit, world frame, dP/du of the chart; chart (F,); height, width in texels.
+    surface's faces; bitangent (T, 3) unit, world frame, against which v grows in the chart's plane; chart (F,); height, width in texels.
     """
 
     uv: Float
     vertex: Int
     faces: Int
-    tangent: Float
+    bitangent: Float
     chart: Int
     height: int
     width: int
@@ -82,10 +82,14 @@ def build_atlas(surface: Surface, texel: float) -> Atlas:
 
 
 def vertex_tangents(atlas: Atlas, normal: Float) -> Float:
-    """(T, 3) unit tangents of the atlas' vertices, made perpendicular to the vertex normals (V, 3) of the surface."""
+    """(T, 3) unit tangents of the atlas' vertices: dP/du of the plane across the vertex normals (V, 3) of the surface.
+
+    There v stays, so that dP/du is across the bitangent too. Readers that make their own tangents of the texture coordinates (Blender, all
+    of an OBJ file) make the same, but for the difference between the faces' planes and the vertices'.
+    """
     n = normal[atlas.vertex]
-    tangent = atlas.tangent - (atlas.tangent * n).sum(-1, keepdims=True) * n
-    # A normal along the chart's tangent leaves no direction; any perpendicular one is as good.
+    tangent = np.cross(atlas.bitangent, n)
+    # A normal along the bitangent leaves no direction; any perpendicular one is as good.
     lost = np.linalg.norm(tangent, axis=-1) < 1e-6
     tangent[lost] = _frame(n[lost])[0]
     return normalise(tangent)
@@ -277,13 +281,13 @@ def _packed(surface: Surface, chart: Int, axis: Int, texel: float) -> Atlas:
         angle = _narrowest(local)
         cos, sin = np.cos(angle), np.sin(angle)
         points[part] = local @ np.array([[cos, sin], [-sin, cos]])
-        tangent[k] = cos * tangent[k] + sin * bitangent[k]
+        bitangent[k] = cos * bitangent[k] - sin * tangent[k]
     low = np.stack([np.minimum.reduceat(points[:, k], start[:-1]) for k in range(2)], -1)
     high = np.stack([np.maximum.reduceat(points[:, k], start[:-1]) for k in range(2)], -1)
     corner, height, width = _shelves(np.ceil(high - low).astype(np.int64) + PADDING)
     points += (corner - low + PADDING / 2)[of_chart]
     uv = checked("uv", points / (width, height), (None, 2))
-    return Atlas(uv, vertex, faces, tangent[of_chart], chart, height, width)
+    return Atlas(uv, vertex, faces, bitangent[of_chart], chart, height, width)
 
 
 def _shelves(size: Int) -> tuple[Int, int, int]:

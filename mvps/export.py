@@ -2,6 +2,7 @@
 
     mesh.ply                 vertices (world frame, units of the capture), refined normals, albedo as sRGB vertex colour
     model.glb                textured physically based model;  model.obj, .mtl and textures likewise   (where textures are given)
+    model_N.glb              the same with N faces;  model_N.obj, .mtl and textures likewise   (for each N that is given)
     lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
@@ -25,6 +26,7 @@ import re
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -45,11 +47,18 @@ CHECKPOINT = "checkpoint"
 """Folder in a result's place from which an interrupted run goes on (checkpoint.py)."""
 
 
-def write_reconstruction(reconstruction: Reconstruction, folder: Path, textures: Textures | None = None, report: str = "") -> None:
+def write_reconstruction(
+    reconstruction: Reconstruction,
+    folder: Path,
+    textures: Textures | None = None,
+    report: str = "",
+    levels: Mapping[int, Textures] = MappingProxyType({}),
+) -> None:
     """Write a result folder, whole or not at all.
 
     An empty folder or an earlier result at the same place is replaced; CaptureError where something else is there. Without
     `textures` (see mvps.texture.bake) the textured models are left out, without a `report` (HTML) report.html is.
+    levels: textures of models with fewer faces, by the numbers in their names.
     ValueError where metrics or settings are not plain JSON values.
     """
     files = {
@@ -60,7 +69,9 @@ def write_reconstruction(reconstruction: Reconstruction, folder: Path, textures:
     with appearing_whole(folder, RESULT_MARKS, CHECKPOINT) as writing:
         files |= _mesh_files(reconstruction)
         if textures is not None:
-            files |= _model_files(reconstruction, textures)
+            files |= _model_files("model", textures)
+        for faces, of_level in levels.items():
+            files |= _model_files(f"model_{faces}", of_level)
         if report:
             files["report.html"] = report.encode("utf-8")
         for name, content in files.items():
@@ -223,38 +234,38 @@ def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
     return {"mesh.ply": ply_bytes(mesh, comment), "material.npz": arrays.getvalue()}
 
 
-def _model_files(reconstruction: Reconstruction, textures: Textures) -> dict[str, bytes]:
-    surface, atlas = reconstruction.surface, textures.atlas
+def _model_files(name: str, textures: Textures) -> dict[str, bytes]:
+    surface, atlas = textures.surface, textures.atlas
     pictures = [textures.base_color, textures.normal_map, textures.roughness, textures.specular_color, metallic_roughness(textures)]
     with ThreadPoolExecutor(at_a_time()) as pool:
         # Text is formatted under the interpreter's lock, pictures are compressed without it.
         encoded = pool.map(png_bytes, pictures)
-        obj = obj_bytes(surface.vertices, textures.mesh_normal, atlas.uv, surface.faces, atlas.faces, "model")
+        obj = obj_bytes(surface.vertices, textures.mesh_normal, atlas.uv, surface.faces, atlas.faces, name)
         base_color, normal, roughness, specular, of_glb = encoded
     return {
-        "model_base_color.png": base_color,
-        "model_normal.png": normal,
-        "model_roughness.png": roughness,
-        "model_specular.png": specular,
-        "model.glb": glb_bytes(
-            surface.vertices, textures, {"base_color": base_color, "normal": normal, "metallic_roughness": of_glb, "specular": specular}
+        f"{name}_base_color.png": base_color,
+        f"{name}_normal.png": normal,
+        f"{name}_roughness.png": roughness,
+        f"{name}_specular.png": specular,
+        f"{name}.glb": glb_bytes(
+            textures, {"base_color": base_color, "normal": normal, "metallic_roughness": of_glb, "specular": specular}
         ),
-        "model.obj": obj,
-        "model.mtl": _mtl(textures),
+        f"{name}.obj": obj,
+        f"{name}.mtl": _mtl(name, textures),
     }
 
 
-def _mtl(textures: Textures) -> bytes:
+def _mtl(name: str, textures: Textures) -> bytes:
     """Wavefront material with the physically based extension of Clara.io (Pr: roughness, Pm: metallic, norm: normal map)."""
     lines = [
-        "newmtl model",
+        f"newmtl {name}",
         "Kd 1 1 1",
-        "map_Kd model_base_color.png",
+        f"map_Kd {name}_base_color.png",
         "Ks" + f" {textures.specular_level:.6g}" * 3,
-        "map_Ks model_specular.png",
+        f"map_Ks {name}_specular.png",
         "Pm 0",
-        "map_Pr model_roughness.png",
-        "norm model_normal.png",
+        f"map_Pr {name}_roughness.png",
+        f"norm {name}_normal.png",
         "",
     ]
     return "\n".join(lines).encode("ascii")

@@ -3,9 +3,10 @@
     GLB = header, JSON chunk (padded with spaces), binary chunk (padded with zeros), all little-endian and on 4-byte borders.
 
 Attributes POSITION, NORMAL (mesh normals), TANGENT (w = 1: bitangent = normal x tangent) and TEXCOORD_0. The specular
-reflection at normal incidence F0 goes into KHR_materials_specular: F0 = 0.04 specularColorFactor specularColorTexture.
+reflection at normal incidence F0 goes into KHR_materials_specular: F0 = 0.04 specularColorFactor specularColorTexture; glTF dims the
+base colour by 1 - max F, for which it is divided by 1 - max F0 beforehand.
 glTF's unit is the metre and its up axis is y; a capture has neither, so coordinates are kept as they are, and the
-material's extras say by what albedo was divided.
+material's extras say how albedo follows from the base colour.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from mvps.atlas import vertex_tangents
 from mvps.mesh import normalise
-from mvps.scene import Float
 from mvps.texture import Textures
 
 DIELECTRIC = 0.04
@@ -35,8 +35,8 @@ def metallic_roughness(textures: Textures) -> NDArray[np.uint8]:
     return np.stack([zero, textures.roughness, zero], -1)
 
 
-def glb_bytes(vertices: Float, textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
-    """The surface's vertices (V, 3) with their textures as a GLB file.
+def glb_bytes(textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
+    """A surface with its textures as a GLB file.
 
     pictures: base_color, normal, metallic_roughness and specular as PNG files, in this order.
     """
@@ -44,7 +44,7 @@ def glb_bytes(vertices: Float, textures: Textures, pictures: Mapping[str, bytes]
     normal = normalise(textures.mesh_normal)
     tangent = vertex_tangents(atlas, normal)
     arrays = {
-        "POSITION": vertices[atlas.vertex],
+        "POSITION": textures.surface.vertices[atlas.vertex],
         "NORMAL": normal[atlas.vertex],
         "TANGENT": np.concatenate([tangent, np.ones((len(tangent), 1))], 1),
         "TEXCOORD_0": atlas.uv,
@@ -86,7 +86,7 @@ def _material(textures: Textures) -> dict[str, Any]:
         },
         "normalTexture": {"index": 1},
         "extensions": {"KHR_materials_specular": specular},
-        "extras": {"albedo_scale": textures.scale, "albedo": "albedo = albedo_scale * base colour (linear)"},
+        "extras": {"albedo_scale": textures.scale, "albedo": "albedo = albedo_scale * base colour (linear) * (1 - max F0)"},
     }
 
 

@@ -1,8 +1,8 @@
-"""Discrete geometry on a triangle mesh (V, F): normals, areas, angles, edges, remeshing, cleaning."""
+"""Discrete geometry on a triangle mesh (V, F): normals, areas, angles, edges, nearest points, remeshing, decimation, cleaning."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -172,3 +172,36 @@ def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) 
         np.array(surface.vertices), np.array(surface.faces, dtype=np.int32), i=iterations, h=edge_length, project=True
     )
     return largest_component(Surface(vertices, faces))
+
+
+def decimated(surface: Surface, faces: int) -> Surface:
+    """The surface with about `faces` faces, by collapsing edges (quadrics: Garland and Heckbert 1997).
+
+    As it is where it has no more, or where an edge has more than two faces, which collapsing cannot do with.
+    """
+    import igl
+
+    if faces >= len(surface.faces):
+        return surface
+    vertices, fewer, *_ = igl.qslim(np.asfortranarray(surface.vertices), np.asfortranarray(surface.faces, np.int32), faces)
+    return Surface(vertices, fewer) if len(fewer) else surface
+
+
+class Nearest(NamedTuple):
+    """Nearest points of a surface: distance (n,), point (n, 3), face (n,), barycentric (n, 3) of the face's corners."""
+
+    distance: Float
+    point: Float
+    face: Int
+    barycentric: Float
+
+
+def nearest(surface: Surface, points: Float) -> Nearest:
+    """Of the surface to points (n, 3)."""
+    import igl
+
+    vertices, faces = np.array(surface.vertices), np.array(surface.faces)
+    squared, face, point = igl.point_mesh_squared_distance(np.ascontiguousarray(points), vertices, faces)
+    corners = vertices[faces[face]]
+    barycentric = np.nan_to_num(igl.barycentric_coordinates(point, *(np.ascontiguousarray(corners[:, k]) for k in range(3))))
+    return Nearest(np.sqrt(squared), point, face, np.clip(barycentric, 0, 1))

@@ -1,31 +1,42 @@
-"""From albedo and spherical Gaussians to the metallic-roughness model of glTF 2.0 (its appendix B).
+"""From albedo and spherical Gaussians to the metallic-roughness model of glTF 2.0 (its appendix B, KHR_materials_specular).
 
-Ours, pi times the reflection factor up to the unknown exposure g:   albedo + sum_k w_k exp(s_k (h.n - 1))
-glTF's, times pi, without masking and Fresnel's rise:                base + F0 pi D(h.n) / 4,   D = GGX, pi D(1) = 1 / alpha^2
+Ours, pi times the reflection factor up to the unknown exposure g:   albedo + sum_k w_k lobe_k(h.n)
+glTF's, times pi:           base (1 - max F) + pi F D V,   F = F0 + (1 - F0) (1 - v.h)^5,   D GGX of alpha = roughness^2, V Smith's
 
-Both lobes get the same peak and the same integral over half vectors. The integral of exp(s (h.n - 1)) is 2 pi / s (up to
-e^-2s), and GGX, whose projected integral is 1, has pi alpha^2 per unit of its peak, so with W = sum_k w_k, E = sum_k w_k / s_k
+alpha and F0 are those with which g F0 pi D V comes closest to the lobes, by least squares over the directions that a camera sees beside
+its lights (`_directions`), cosine of incidence included. With M(alpha) = <lobes, pi D V> / |pi D V| that is the alpha of the largest
+w . M(alpha), and g F0 = w . M / |pi D V|. Fresnel's rise is left out of the fit: lights within SPREAD of the camera lie far from it.
 
-    alpha^2 = 2 E / W   (one lobe: s = 2 / alpha^2, as for Beckmann's),     roughness = sqrt(alpha),
-    F0      = 4 alpha^2 W / g = 8 E / g,       base = albedo / g.
+    base = albedo / (g (1 - max F0)),   because glTF takes what is reflected from what enters the body.
 
-The exposure g is not observable. It is chosen so that base + F0, the share of light reflected, reaches 1 on the brightest
-thousandth of the surface. Metallic is 0 everywhere: F0 carries the colour of a metal, by KHR_materials_specular.
+The exposure g is not observable. It is chosen so that base is at most 1, albedo / g + max F0 <= 1, but for the brightest thousandth of
+the surface. Metallic is 0 everywhere: F0 carries the colour of a metal, by KHR_materials_specular.
+
+Without masking a lobe and GGX of one peak and one integral over half vectors have  alpha^2 = 2 / s  and  F0 = 8 w / (s g)
+(`specular_energy`): what edits of a material and the pictures' white level go by.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mvps.scene import Float, Material
+from mvps.scene import Float, Law, Material
+from mvps.shading import lobes_of
 
 BRIGHTEST = 99.9
 """Percentile of the reflectance that becomes 1: one vertex in a thousand may be an outlier and is clipped."""
-SMOOTHEST = 1e-4
-"""Smallest alpha^2: half of a sharper lobe (s over 20000) lies within half a degree, less than normals are known to."""
+SMOOTHEST, ALPHAS = 1e-2, 64
+"""Smallest alpha: half of a sharper lobe (s over 20000) lies within half a degree, less than normals are known to; and how many are tried,
+at equal ratios, from half the alpha of the sharpest lobe to twice that of the widest."""
+SPREAD = np.radians(50)
+"""Largest angle between light and view: photometric stereo's lights surround the camera."""
+STEEPEST = np.radians(75)
+"""Largest angle between normal and half vector: beyond it light or view are below the horizon, or nearly."""
+ROWS_PER_CHUNK = 1 << 16
 
 
 def specular_energy(specular_weight: Float, sharpness: Float) -> Float:
@@ -35,13 +46,47 @@ def specular_energy(specular_weight: Float, sharpness: Float) -> Float:
     return energy
 
 
-def roughness(specular_weight: Float, sharpness: Float) -> Float:
-    """(n,) roughness of glTF in [0, 1]; 1 where there is no specular reflection."""
-    weight = specular_weight.mean(-1) if specular_weight.ndim == 3 else specular_weight
-    total = weight.sum(1)
-    alpha_squared = np.divide(2 * (weight @ (1 / sharpness)), total, out=np.ones(len(weight)), where=total > 0)
-    rough: Float = alpha_squared.clip(SMOOTHEST, 1) ** 0.25
-    return rough
+def glossy(specular_weight: Float, law: Law) -> tuple[Float, Float]:
+    """(n,) roughness of glTF in [0, 1], 1 where there is no specular reflection, and (n, 3) g F0, from weights (n, lobes[, 3]) of a law."""
+    weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None]
+    rough, reflected = np.ones(len(weight)), np.zeros((len(weight), 3))
+    shining = np.flatnonzero(weight.any((1, 2)))
+    if len(shining):
+        alpha, alike, length = _alike(law)
+    for start in range(0, len(shining), ROWS_PER_CHUNK):
+        part = shining[start : start + ROWS_PER_CHUNK]
+        of_part = weight[part].astype(np.float32)
+        best = (of_part.mean(-1) @ alike).argmax(1)
+        rough[part] = np.sqrt(alpha[best])
+        reflected[part] = np.einsum("nkc,nk->nc", of_part, (alike / length).T[best])
+    return rough, reflected
+
+
+@lru_cache(maxsize=8)
+def _alike(law: Law) -> tuple[Float, NDArray[np.float32], NDArray[np.float32]]:
+    """alpha (ALPHAS,) that are tried; M (lobes, ALPHAS); |pi D V| (ALPHAS,)."""
+    n_dot_l, n_dot_v, h_dot_n, share = _directions()
+    widest, sharpest = (np.sqrt(2 / s) for s in (min(law.sharpness), max(law.sharpness)))
+    alpha = np.geomspace(np.clip(sharpest / 2, SMOOTHEST, 1), np.clip(2 * widest, SMOOTHEST, 1), ALPHAS)
+    ours = lobes_of(h_dot_n, law) * (share * n_dot_l)[:, None]
+    square = alpha**2
+    smith = [x[:, None] + np.sqrt(square + (1 - square) * x[:, None] ** 2) for x in (n_dot_l, n_dot_v)]
+    ggx = square / (h_dot_n[:, None] ** 2 * (square - 1) + 1) ** 2 / (smith[0] * smith[1]) * (share * n_dot_l)[:, None]
+    length = np.linalg.norm(ggx, axis=0)
+    return alpha, (ours.T @ ggx / length).astype(np.float32), length.astype(np.float32)
+
+
+def _directions() -> tuple[Float, Float, Float, Float]:
+    """n.l, n.v, h.n (n,) of pairs of light and view up to SPREAD apart, and the root of their share of a picture: pixels, that is n.v of
+    solid angle, times the light's solid angle. Half vectors lie densely around the normal, where sharp lobes are."""
+    t, d, turn = np.meshgrid((np.arange(96) + 0.5) / 96, (np.arange(8) + 0.5) / 8, (np.arange(12) + 0.5) / 12, indexing="ij")
+    tilt, apart, around = (a.ravel() for a in (STEEPEST * t**3, SPREAD / 2 * d, 2 * np.pi * turn))
+    side = np.sin(tilt) * np.sin(apart) * np.cos(around)
+    n_dot_l, n_dot_v = (np.cos(tilt) * np.cos(apart) + sign * side for sign in (1, -1))
+    # Of h and the angle between h and v:  dl dv = 4 cos(apart) sin(apart) sin(tilt), and  d tilt ~ t^2 dt.
+    share = n_dot_v * np.cos(apart) * np.sin(apart) * np.sin(tilt) * t.ravel() ** 2
+    above = (n_dot_l > 0) & (n_dot_v > 0)
+    return n_dot_l[above], n_dot_v[above], np.cos(tilt)[above], np.sqrt(share[above])
 
 
 def reflectance_scale(material: Material) -> float:

@@ -49,7 +49,8 @@ long as the residual falls."""
 class Settings:
     """Everything needed to run a reconstruction again.
 
-    views, lights: numbers to use, counted from 1, empty for all; hold_out_views, hold_out_lights: numbers kept back for evaluation.
+    views, lights: numbers to use, counted from 1, empty for all; hold_out_views, hold_out_lights: numbers kept back for evaluation;
+    faces: of the smaller models beside the full one.
     """
 
     capture: str
@@ -61,6 +62,7 @@ class Settings:
     calibrated_lights: bool = False
     device: str = "auto"
     seed: int = 0
+    faces: Numbers = ()
 
 
 def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) -> tuple[Capture, Capture | None]:
@@ -240,6 +242,7 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     """Textures, report and the result folder."""
     from mvps.export import write_reconstruction
     from mvps.joint.thinned import thinned
+    from mvps.mesh import decimated
     from mvps.report import report_html
     from mvps.texture import bake
 
@@ -248,11 +251,13 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
         # A texel is seen by several views: their kept lights together determine its albedo several times over.
         part, lights = thinned(used, lights_of(reconstruction, used))
         density = TEXELS_PER_PIXEL[settings.preset]
-        textures = bake(reconstruction.surface, reconstruction.material, lights, part, density)
+        surface = reconstruction.surface
+        shells = [decimated(surface, faces) for faces in settings.faces]
+        textures, *levels = bake(surface, reconstruction.material, lights, part, density, shells)
     metrics = {**reconstruction.metrics, "stages": progress.stages}
     finished = replace(reconstruction, metrics=metrics)
     with progress.stage("report and files"):
-        write_reconstruction(finished, out, textures, report_html(finished, capture))
+        write_reconstruction(finished, out, textures, report_html(finished, capture), dict(zip(settings.faces, levels, strict=True)))
 
 
 def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Lights | None, resume: bool) -> Checkpoints:
@@ -281,6 +286,9 @@ def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
     return Lights(tuple(directions), tuple(intensities), reconstruction.lights.one_rig)
 
 
+FACES_HELP = "write models of about so many faces too (model_N.glb, model_N.obj), their detail in the normal map"
+
+
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     made = parser("mvps.reconstruct", __doc__ or "")
@@ -295,6 +303,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
     made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or end with what it takes")
     made.add_argument("--seed", type=int, default=0, help="of all random draws")
+    made.add_argument("--faces", type=number_list, default=(), metavar="N,N", help=FACES_HELP)
     made.add_argument("--resume", action="store_true", help="go on where an interrupted run with the same options stopped")
     given = parse(made, argv)
     settings = Settings(
@@ -307,6 +316,7 @@ def main(argv: Sequence[str]) -> None:
         given.calibrated_lights,
         given.device,
         given.seed,
+        given.faces,
     )
     from mvps.export import CHECKPOINT, RESULT_MARKS
     from mvps.folders import check_place

@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvps.scene import GRAZING_POWER, Law
+from mvps.scene import GRAZING_POWER, Float, Law
 
 QUADRATURE = 64
 """Nodes of Gauss and Legendre: enough for sharpness up to 10^4."""
@@ -56,6 +56,12 @@ def lobes(h_dot_n: Tensor, law: Law) -> Tensor:
     """(..., lobes) values of the law's lobes for h . n (...)."""
     values = [lobe(h_dot_n, s, law.microfacet)[0] for s in law.sharpness]
     return torch.stack(values, -1) if values else h_dot_n.new_zeros(*h_dot_n.shape, 0)
+
+
+def lobes_of(h_dot_n: Float, law: Law) -> NDArray[np.float64]:
+    """`lobes` of an array."""
+    values: NDArray[np.float64] = lobes(torch.from_numpy(h_dot_n), law).numpy()
+    return values
 
 
 @functools.cache

@@ -13,10 +13,14 @@ vertices' albedo.
 
 Normal map. T, N: interpolated tangent and mesh normal, B = N x T; the refined normal n is stored as (x, y, z) with
 x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
+
+Levels of detail. A texel of a shell, a surface with fewer faces, shows the nearest point of the full one: its albedo from the
+photographs, its material, its refined normal, which the normal map then tells relative to the shell's.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,10 +31,10 @@ from numpy.typing import NDArray
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
 from mvps.cores import one_by_one
-from mvps.mesh import face_areas, lengths, normalise, vertex_normals
-from mvps.pbr import roughness, specular_energy, srgb_bytes, white_level
+from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
+from mvps.pbr import glossy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
-from mvps.scene import Bool, Capture, Float, Int, Lights, Material, Surface, View
+from mvps.scene import Bool, Capture, Float, Int, Law, Lights, Material, Surface, View
 from mvps.visibility import RayCaster, ray_caster
 
 LARGEST_SIDE = 4096
@@ -43,18 +47,22 @@ REWEIGHTINGS = 4
 STEEPEST_VIEW = 0.2
 """Smallest cosine between normal and view direction: beyond, one pixel spreads over more than five texels."""
 
+LEAST_ENTERING = 1e-3
+"""Smallest share of light that enters the body: where F0 is 1, nothing is left for a base colour to return."""
+
 
 @dataclass(frozen=True, eq=False)
 class Textures:
-    """An atlas with its pictures, each (height, width) of the atlas.
+    """A surface with an atlas and its pictures, each (height, width) of the atlas.
 
     mesh_normal       (V, 3) unit vertex normals that the normal map is relative to
-    base_color        (h, w, 3) uint8 sRGB of albedo / scale, with the scale of mvps.pbr for the texels
+    base_color        (h, w, 3) uint8 sRGB of albedo / (scale (1 - max F0)), with the scale of mvps.pbr for the texels
     normal_map        (h, w, 3) uint8;  roughness (h, w) uint8, linear
     specular_color    (h, w, 3) uint8 sRGB of F0 / specular_level, the largest F0 (mvps.pbr)
     from_photographs  share of texels that a view saw
     """
 
+    surface: Surface
     atlas: Atlas
     mesh_normal: Float
     base_color: NDArray[np.uint8]
@@ -66,36 +74,75 @@ class Textures:
     from_photographs: float
 
 
-def bake(surface: Surface, material: Material, lights: Lights, capture: Capture, texels_per_pixel: float) -> Textures:
-    """Textures of a surface with its material, from a capture's photographs under lights (in the order of the capture's views).
+def bake(
+    surface: Surface, material: Material, lights: Lights, capture: Capture, texels_per_pixel: float, shells: Sequence[Surface] = ()
+) -> list[Textures]:
+    """Textures of a surface with its material, then of shells near it, all with the surface's exposure.
 
-    texels_per_pixel: along one pixel's footprint. ValueError where the lights do not fit the capture's photographs.
+    They are made from a capture's photographs under lights (in the order of the capture's views). texels_per_pixel: along one pixel's
+    footprint. ValueError where the lights do not fit the capture's photographs.
     """
     _check_lights(lights, capture)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
-    smallest = np.sqrt(face_areas(surface).sum() / FILLED) / LARGEST_SIDE
-    atlas = build_atlas(surface, max(pixel / texels_per_pixel, float(smallest)))
+    normal = normalise(vertex_normals(surface))
+    levels = (surface, *shells)
+    charted = [_charted(surface, shell, pixel / texels_per_pixel) for shell in levels]
+    places = [tuple(_at(source, surface, values) for values in (surface.vertices, normal)) for _, _, source in charted]
+    position, outward = (np.concatenate(values) for values in zip(*places, strict=True))
+    albedo, seen = _photographed_albedo(surface, material, lights, capture, position, normalise(outward))
+    ends = np.cumsum([len(source.face) for _, _, source in charted])
+    made: list[Textures] = []
+    for shell, (atlas, texels, source), end in zip(levels, charted, ends, strict=True):
+        part = slice(end - len(source.face), end)
+        of_shell = np.where(seen[part, None], albedo[part], _at(source, surface, material.albedo))
+        weight, refined = (_at(source, surface, values) for values in (material.specular_weight, material.normal))
+        scale = made[0].scale if made else None
+        share = float(seen[part].mean()) if end > part.start else 0.0
+        made.append(_pictures(shell, atlas, texels, of_shell, weight, refined, material.law, share, scale))
+    return made
+
+
+def _charted(surface: Surface, shell: Surface, texel: float) -> tuple[Atlas, Texels, Texels]:
+    """The shell's atlas with texels of about this side, its texels, and those with the faces of the surface that they show."""
+    smallest = np.sqrt(face_areas(shell).sum() / FILLED) / LARGEST_SIDE
+    atlas = build_atlas(shell, max(texel, float(smallest)))
     texels = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
-    mesh_normal = vertex_normals(surface)
-    position, normal = (_at(texels, surface, values) for values in (surface.vertices, normalise(mesh_normal)))
-    albedo, seen = _photographed_albedo(surface, material, lights, capture, position, normalise(normal))
-    albedo = np.where(seen[:, None], albedo, _at(texels, surface, material.albedo))
-    weight = _at(texels, surface, material.specular_weight)
-    specular = specular_energy(weight, material.sharpness)
-    scale = white_level(albedo + specular)
-    specular /= scale
+    if shell is surface:
+        return atlas, texels, texels
+    shown = nearest(surface, _at(texels, shell, shell.vertices))
+    return atlas, texels, texels._replace(face=shown.face, barycentric=shown.barycentric)
+
+
+def _pictures(
+    shell: Surface,
+    atlas: Atlas,
+    texels: Texels,
+    albedo: Float,
+    weight: Float,
+    refined: Float,
+    law: Law,
+    from_photographs: float,
+    scale: float | None,
+) -> Textures:
+    """Textures of albedo, lobes' weights and refined normals (n, ...) at the texels of a shell; scale: None for that of mvps.pbr."""
+    rough, specular = glossy(weight, law)
+    scale = white_level(albedo + specular.max(1, keepdims=True)) if scale is None else scale
+    specular = np.minimum(specular / scale, 1)
+    entering = np.maximum(1 - specular.max(1, keepdims=True), LEAST_ENTERING)
     level = min(white_level(specular), 1.0) if (specular > 0).any() else 0.0
-    shading = _tangent_space(atlas, texels, mesh_normal, _at(texels, surface, material.normal))
+    mesh_normal = vertex_normals(shell)
+    shading = _tangent_space(atlas, texels, mesh_normal, refined)
     return Textures(
+        surface=shell,
         atlas=atlas,
         mesh_normal=mesh_normal,
-        base_color=_picture(atlas, texels, srgb_bytes(albedo / scale)),
+        base_color=_picture(atlas, texels, srgb_bytes(albedo / (scale * entering))),
         normal_map=_picture(atlas, texels, np.rint((shading + 1) * 127.5).astype(np.uint8)),
-        roughness=_picture(atlas, texels, np.rint(roughness(weight, material.sharpness) * 255).astype(np.uint8)),
+        roughness=_picture(atlas, texels, np.rint(rough * 255).astype(np.uint8)),
         specular_color=_picture(atlas, texels, srgb_bytes(specular / (level or 1.0))),
         specular_level=level,
         scale=scale,
-        from_photographs=float(seen.mean()) if len(seen) else 0.0,
+        from_photographs=from_photographs,
     )
 
 

@@ -18,6 +18,7 @@ from sphere_scene import SphereScene, make_sphere
 import mvps.export
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.folders import appearing_whole
+from mvps.mesh import decimated
 from mvps.pbr import reflectance_scale
 from mvps.scene import CaptureError, Material, Reconstruction
 from mvps.texture import Textures, bake
@@ -31,13 +32,22 @@ def scene() -> SphereScene:
 @pytest.fixture(scope="module")
 def textures(scene: SphereScene) -> Textures:
     r = scene.reconstruction
-    return bake(r.surface, r.material, r.lights, scene.capture, 2)
+    return bake(r.surface, r.material, r.lights, scene.capture, 2)[0]
 
 
 @pytest.fixture
 def folder(scene: SphereScene, textures: Textures, tmp_path: Path) -> Path:
     write_reconstruction(scene.reconstruction, tmp_path / "result", textures, "<p>report</p>")
     return tmp_path / "result"
+
+
+@pytest.fixture
+def levels(scene: SphereScene, tmp_path: Path) -> Path:
+    """A result with a second model of 100 faces."""
+    r = scene.reconstruction
+    full, level = bake(r.surface, r.material, r.lights, scene.capture, 2, [decimated(r.surface, 100)])
+    write_reconstruction(r, tmp_path / "levels", full, "", {100: level})
+    return tmp_path / "levels"
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -91,10 +101,22 @@ def test_the_contract_names_exactly_these_files(scene: SphereScene, folder: Path
     assert set(contents(folder)) == files | views | pictures
 
 
+def test_a_smaller_model_stands_beside_the_full_one(folder: Path, levels: Path) -> None:
+    full, files = contents(folder), contents(levels)
+    small = {name for name in files if name.startswith("model_100")}
+    ends = [".glb", ".mtl", ".obj", *(f"_{name}.png" for name in ("base_color", "normal", "roughness", "specular"))]
+    assert small == {f"model_100{end}" for end in ends} and set(files) - small == set(full) - {"report.html"}
+    assert all(files[name] == full[name] for name in set(files) - small)
+    for name in ("model_100.glb", "model_100.obj"):
+        assert len(trimesh.load(levels / name, force="mesh", process=False).faces) == 100
+    named = {word for line in (levels / "model_100.mtl").read_text().splitlines() for word in line.split() if word.endswith(".png")}
+    assert named == {name for name in small if name.endswith(".png")}
+
+
 def test_same_reconstruction_same_bytes(scene: SphereScene, folder: Path, tmp_path: Path) -> None:
     r = scene.reconstruction
     write_reconstruction(
-        read_reconstruction(folder), tmp_path / "again", bake(r.surface, r.material, r.lights, scene.capture, 2), "<p>report</p>"
+        read_reconstruction(folder), tmp_path / "again", bake(r.surface, r.material, r.lights, scene.capture, 2)[0], "<p>report</p>"
     )
     assert contents(tmp_path / "again") == contents(folder)
 
@@ -158,7 +180,7 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2]))).then(r
 
 
 @pytest.mark.node
-def test_glb_is_valid_to_khronos(folder: Path, tmp_path: Path) -> None:
+def test_glb_is_valid_to_khronos(folder: Path, levels: Path, tmp_path: Path) -> None:
     if not shutil.which("npm"):
         pytest.skip("no npm: install Node.js")
     subprocess.run(["npm", "install", "--silent", "--prefix", ".", "gltf-validator@2.0.0-dev.3.10"], cwd=tmp_path, check=True)
@@ -169,8 +191,9 @@ def test_glb_is_valid_to_khronos(folder: Path, tmp_path: Path) -> None:
         counts: dict[str, int] = json.loads(ran.stdout)
         return counts
 
-    found = issues(folder / "model.glb")
-    assert found["numErrors"] == 0 and found["numWarnings"] == 0, found
+    for file in (folder / "model.glb", levels / "model_100.glb"):
+        found = issues(file)
+        assert found["numErrors"] == 0 and found["numWarnings"] == 0, found
     damaged = tmp_path / "damaged.glb"
     damaged.write_bytes((folder / "model.glb").read_bytes().replace(b'"VEC4"', b'"VEC2"'))
     assert issues(damaged)["numErrors"] > 0

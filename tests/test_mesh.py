@@ -80,3 +80,28 @@ def test_splitting_edges_keeps_a_mesh_closed_its_volume_and_its_orientation() ->
         assert np.isclose(signed_volume(split), signed_volume(ball)) and np.isclose(
             mesh.face_areas(split).sum(), mesh.face_areas(ball).sum()
         )
+
+
+def test_fewer_faces_stay_closed_and_near() -> None:
+    ball = sphere(4)
+    fewer = mesh.decimated(ball, 500)
+    assert len(fewer.faces) == 500 and is_closed(fewer)
+    assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 2).max() < 0.05
+    assert signed_volume(fewer) > 0.97 * signed_volume(ball)
+    assert mesh.decimated(ball, len(ball.faces)) is ball
+
+
+def test_an_edge_of_three_faces_keeps_its_surface() -> None:
+    fan = Surface(np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, -1, 0]]), np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
+    assert mesh.decimated(fan, 1) is fan
+
+
+def test_nearest_points_by_trimesh() -> None:
+    ball = sphere(2)
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    found = mesh.nearest(ball, points)
+    near, distance, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(ball.vertices, ball.faces, process=False), points)
+    np.testing.assert_allclose(found.distance, distance, atol=1e-9)
+    np.testing.assert_allclose(found.point, near, atol=1e-9)
+    corners = ball.vertices[ball.faces[found.face]]
+    np.testing.assert_allclose(np.einsum("nk,nkc->nc", found.barycentric, corners), found.point, atol=1e-9)

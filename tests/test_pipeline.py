@@ -61,7 +61,8 @@ def test_figures_of_the_embedded_capture(capture: Path, result: Path) -> None:
 
 
 def test_a_draft_goes_without_the_occupancy_field(capture: Path, tmp_path: Path) -> None:
-    out = reconstructed(capture, tmp_path / "draft", preset="draft")
+    out = reconstructed(capture, tmp_path / "draft", "--faces", "400,100", preset="draft")
+    assert {path.name for path in out.glob("model*.glb")} == {"model.glb", "model_400.glb", "model_100.glb"}
     assert "occupancy field" not in {stage["name"] for stage in read_reconstruction(out).metrics["stages"]}
     found = figures(out, capture)
     assert found["light_error_deg"] < 1.0 and found["map_normal_error_deg"] < 4.0 and found["chamfer_px"] < 0.5

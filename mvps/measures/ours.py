@@ -18,14 +18,13 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
-import igl
 import numpy as np
 
 from mvps.camera import pixel_footprint
 from mvps.measures.images import photograph_errors
 from mvps.measures.lights import by_photograph, held_out_photographs, held_out_views, light_errors, true_lights, unseen_views
 from mvps.measures.points import f_score
-from mvps.mesh import angles_deg, normalise, vertex_normals
+from mvps.mesh import angles_deg, nearest, normalise, vertex_normals
 from mvps.scene import RELIABLE, Capture, Float, Material, Reconstruction, Surface, Truth, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 
@@ -50,14 +49,10 @@ def first_hit_points(surface: Surface, capture: Capture) -> Float:
 
 def distance_to(points: Float, surface: Surface) -> tuple[Float, Float]:
     """Distance (n,) of points (n, 3) to the nearest point of the surface, and the same with a sign, negative inside."""
-    vertices, faces = np.array(surface.vertices), np.array(surface.faces)
-    squared, face, nearest = igl.point_mesh_squared_distance(np.ascontiguousarray(points), vertices, faces)
-    distance = np.sqrt(squared)
+    distance, point, face, barycentric = nearest(surface, points)
     # The normal interpolated from the vertices tells inside from outside on edges and corners too, where a face's does not.
-    corners = vertices[faces[face]]
-    barycentric = np.nan_to_num(igl.barycentric_coordinates(nearest, *(np.ascontiguousarray(corners[:, k]) for k in range(3))))
-    normal = interpolate(surface, Hits(face, np.clip(barycentric, 0, 1), distance), vertex_normals(surface))
-    inside = ((points - nearest) * normal).sum(-1) < 0
+    normal = interpolate(surface, Hits(face, barycentric, distance), vertex_normals(surface))
+    inside = ((points - point) * normal).sum(-1) < 0
     return distance, np.where(inside, -distance, distance)
 
 
