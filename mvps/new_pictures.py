@@ -65,8 +65,14 @@ def write_pictures(given: Namespace) -> None:
 
 
 def chosen_cameras(given: Namespace, result: Reconstruction) -> dict[str, Camera]:
-    """By name, those of the first option that names any."""
+    """By name, those of the option that names any. CaptureError where two do, or an option lacks the one that it belongs to."""
     width, height = given.size
+    named = [f"--{option}" for option in ("cameras", "camera", "turntable") if option in given]
+    if len(named) > 1:
+        raise CaptureError(f"wanted one of --cameras, --camera and --turntable, given {' and '.join(named)}")
+    for option, owner in (("target", "camera"), ("views", "capture")):
+        if option in given and owner not in given:
+            raise CaptureError(f"--{option}: wanted together with --{owner}, given alone")
     centre, _ = ball_around(result.surface)
     if "cameras" in given:
         return read_cameras(given.cameras)

@@ -69,8 +69,14 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     """What is reconstructed from, and the same views with the lights that were kept back plus the views that were, all their lights
     (None where nothing is).
 
-    CaptureError where nothing would be left to reconstruct from.
+    CaptureError where the capture has no such view or light, and where nothing would be left to reconstruct from.
     """
+    views = {int(view.name[5:]) for view in capture.views}
+    lights = {number for view in capture.views for number in view.lights}
+    for what, wanted, there in (("views", hold_out_views, views), ("lights", hold_out_lights, lights)):
+        unknown = sorted(set(wanted) - there)
+        if unknown:
+            raise CaptureError(f"--hold-out-{what}: wanted some of {', '.join(map(str, sorted(there)))}, given {unknown[0]}")
     keep: dict[str, list[int]] = {}
     back: dict[str, list[int]] = {}
     for view in capture.views:

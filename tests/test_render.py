@@ -179,6 +179,9 @@ def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp
         (["--envmap", "nowhere.hdr"], "nowhere.hdr: wanted an environment map"),
         (["--cameras", "nowhere.json"], "nowhere.json"),
         (["--camera", "0,0,0", "--target", "0,0,0"], "wanted an eye away"),
+        (["--camera", "0,0,9", "--turntable", "8"], "wanted one of --cameras, --camera and --turntable, given --camera and --turntable"),
+        (["--turntable", "8", "--target", "0,0,0"], "--target: wanted together with --camera"),
+        (["--turntable", "8", "--views", "1"], "--views: wanted together with --capture"),
         ([], "wanted --capture"),
     ],
 )
