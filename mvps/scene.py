@@ -214,6 +214,12 @@ RELIABLE = 0.2
 confidence = 1 / (1 + (sigma / RELIABLE)^2) with sigma the standard deviation along either tangent."""
 
 
+def expected_error_deg(confidence: Float) -> Float:
+    """Mean error, degrees, of normals with this confidence (n,) above 0: sqrt(pi / 2) times the standard deviation along a tangent."""
+    error: Float = np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(np.maximum(1 / confidence - 1, 0)))
+    return error
+
+
 @dataclass(frozen=True, eq=False)
 class NormalMap:
     """Photometric stereo of one view, at its foreground pixels.

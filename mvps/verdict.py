@@ -21,7 +21,7 @@ from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.material import POOR_FIT
 from mvps.mesh import normalise
-from mvps.scene import RELIABLE, Capture, Float, Int, Material, Surface, View
+from mvps.scene import Capture, Float, Int, Material, Surface, View, expected_error_deg
 from mvps.silhouette import mask_distances, sampled
 from mvps.visibility import RayCaster, camera_hits, ray_caster, visible_vertices
 
@@ -68,8 +68,7 @@ def noise_share(capture: Capture) -> float:
 def expected_deg(material: Material) -> float:
     """Mean expected error of the seen vertices' normals, degrees, none over 90; 90 where none is seen."""
     seen = material.confidence[material.confidence > 0]
-    expected = np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(1 / seen - 1))
-    return float(np.minimum(expected, 90).mean()) if len(seen) else 90.0
+    return float(np.minimum(expected_error_deg(seen), 90).mean()) if len(seen) else 90.0
 
 
 def _silhouette(caster: RayCaster, view: View, distance: NDArray[np.float32]) -> tuple[float, float]:

@@ -18,7 +18,7 @@ import mvps.report.page
 from mvps.report import report_html, write_report
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.page import _truth
-from mvps.report.pictures import ERROR_SPAN, LARGEST_SIDE, view_pictures
+from mvps.report.pictures import ERROR_SPAN, EXPECTED_SPAN, LARGEST_SIDE, view_pictures
 from mvps.scene import Capture, Lights
 from mvps.visibility import RayCaster
 
@@ -31,7 +31,7 @@ METRICS: dict[str, Any] = {
         {"round": 1, "residual": 0.0321, "light_change_deg": 1.5, "normal_change_deg": 3.0, "vertex_change_px": 0.4},
         {"round": 2, "residual": 0.0123},
     ],
-    "status": {"name": "converged", "text": "the step fell below the tolerance"},
+    "status": {"name": "converged", "text": "the step fell below the tolerance", "expected_deg": 2.5, "misfit": 0.0625},
     "model": {
         "components": [{"name": "two lobes", "kept": True, "gain": 0.125, "seconds": 3.5, "why": "0.1 dB & more than its noise < 0.02"}]
     },
@@ -43,6 +43,7 @@ SECTIONS = {
     "rounds": "Rounds",
     "model": "Reflectance model",
     "findings": "Found in the capture",
+    "status": "How good",
     "truth": "Against ground truth",
 }
 
@@ -106,7 +107,7 @@ def test_the_page_needs_nothing_else(html: str) -> None:
 def test_every_picture_has_words_and_decodes(html: str) -> None:
     page = Page(html)
     images = page.all("img")
-    assert len(images) == 4 * 7
+    assert len(images) == 4 * 8
     for image in images:
         assert image["alt"] and len(image["alt"]) > 10
         data = base64.b64decode((image["src"] or "").partition(",")[2])
@@ -132,6 +133,8 @@ def test_numbers_are_shown(html: str) -> None:
             "two lobes yes",
         ),
         *(
+            "normals: expected error, mean 2.5 deg",
+            "share of the signal 6.25 %",
             "0.125",
             "0.1 dB & more than its noise < 0.02",
             "chamfer mm 0.1875",
@@ -198,7 +201,7 @@ def test_pictures_show_what_they_say(scene: SphereScene) -> None:
     """Photographs by the same image model: the error is black, the photograph and the re-rendering agree."""
     light, pictures = view_pictures(RayCaster(scene.reconstruction.surface), None, scene.reconstruction, scene.capture.views[4])
     by_title = {picture.title: picture for picture in pictures}
-    assert light.startswith("light ") and len(by_title) == 7
+    assert light.startswith("light ") and len(by_title) == 8
     error = by_title[f"error, white = {100 * ERROR_SPAN:.0f} %"]
     assert "mean absolute error 0.0 % of white" in error.text
     difference = by_title["photograph"].image.astype(int) - by_title["re-rendering"].image
@@ -209,6 +212,17 @@ def test_pictures_show_what_they_say(scene: SphereScene) -> None:
     wrong = replace(scene.reconstruction, material=replace(scene.reconstruction.material, albedo=scene.reconstruction.material.albedo * 3))
     _, pictures = view_pictures(RayCaster(wrong.surface), None, wrong, scene.capture.views[4])
     assert pictures[2].image[middle].max() == 255
+
+
+def test_the_expected_error_is_that_of_the_confidence(scene: SphereScene) -> None:
+    r, view = scene.reconstruction, scene.capture.views[4]
+    for confidence, said, shown in ((0.5, "median 14.4 deg", False), (0.0, "median 20.0 deg", True)):
+        material = replace(r.material, confidence=np.full(len(r.surface.vertices), confidence))
+        _, pictures = view_pictures(RayCaster(r.surface), None, replace(r, material=material), view)
+        (picture,) = (p for p in pictures if p.title == f"expected error of normals, white = {EXPECTED_SPAN:.0f} deg")
+        assert said in picture.text
+        middle = picture.image[tuple(s // 2 for s in picture.image.shape[:2])]
+        assert (middle.min() == 255) == shown and middle[0] == 255
 
 
 def test_chart_draws_the_values() -> None:

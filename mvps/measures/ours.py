@@ -25,7 +25,7 @@ from mvps.measures.images import photograph_errors
 from mvps.measures.lights import by_photograph, held_out_photographs, held_out_views, light_errors, true_lights, unseen_views
 from mvps.measures.points import f_score
 from mvps.mesh import angles_deg, nearest, normalise, vertex_normals
-from mvps.scene import RELIABLE, Capture, Float, Material, Reconstruction, Surface, Truth, View
+from mvps.scene import Capture, Float, Material, Reconstruction, Surface, Truth, View, expected_error_deg
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 
 CONFIDENCE_GROUPS = 10
@@ -152,7 +152,7 @@ def confidence_errors(surface: Surface, material: Material, truth: Mapping[str, 
         certain = interpolate(surface, hits, material.confidence)
         known = np.isfinite(true).all(1) & (hits.face >= 0) & (certain > 0)
         normal = normalise(interpolate(surface, hits, material.normal)[known])
-        stated.append(np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(np.maximum(1 / certain[known] - 1, 0))))
+        stated.append(expected_error_deg(certain[known]))
         measured.append(angles_deg(normal, true[known]))
     said, found = (np.concatenate(parts) if parts else np.zeros(0) for parts in (stated, measured))
     if len(said) < CONFIDENCE_GROUPS:

@@ -27,15 +27,16 @@ STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--paper);margin:0 auto;max-width:72rem;padding:1rem}
 h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
 .status{padding:.7em 1em;background:var(--soft);border-left:4px solid var(--mark)}
-.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(7rem,1fr));gap:.6rem}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(10rem,1fr));gap:.6rem}
 figure{margin:0}figure img{width:100%;height:auto;display:block}figcaption{font-size:.85rem}
+.spheres{grid-template-columns:repeat(auto-fill,minmax(12rem,1fr))}.sphere{max-width:20rem}
 .wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
 th,td{text-align:left;padding:.25em .8em .25em 0;border-bottom:1px solid var(--line);vertical-align:top}
 .number{text-align:right;font-variant-numeric:tabular-nums}
 .bar{display:inline-block;height:.7em;background:var(--mark)}
 svg{width:100%;max-width:30rem;height:auto;font-size:12px}svg text{fill:currentColor}
 .axis,.ring{fill:none;stroke:var(--line)}.line{fill:none;stroke:var(--mark);stroke-width:2}.dots{fill:var(--mark)}
-.light{stroke:#777;stroke-width:1}.sphere{max-width:14rem}
+.light{stroke:#777;stroke-width:1}
 pre{background:var(--soft);padding:.8em;overflow-x:auto;font-size:.85rem}
 """
 
@@ -61,6 +62,7 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
         _heading(reconstruction, capture),
         _viewer(reconstruction, capture),
         _findings(metrics.get("findings") or []),
+        _signs(metrics.get("status") or {}),
         _pictures(reconstruction, capture),
         _lights(reconstruction, capture),
         _rounds(metrics.get("rounds") or []),
@@ -154,6 +156,22 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
     return _section("Found in the capture", _columns(findings, names)) if findings else ""
 
 
+SIGNS = {
+    "expected_deg": ("normals: expected error, mean", 1.0, "deg"),
+    "views_deg": ("normals of different views at the same place: standard deviation", 1.0, "deg"),
+    "outline_px": ("outlines against the masks: distance, mean", 1.0, "pixels"),
+    "misfit": ("photographs against the model, without noise: share of the signal", 100.0, "%"),
+    "noise": ("noise of the photographs: share of the signal", 100.0, "%"),
+}
+"""Of the verdict (mvps.verdict): what, factor, unit."""
+
+
+def _signs(status: Mapping[str, Any]) -> str:
+    """By what the result was judged, without knowing the truth."""
+    rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if _is_number(status.get(key))]
+    return _section("How good", _table(["sign", "value", ""], rows)) if rows else ""
+
+
 def _known_views(reconstruction: Reconstruction, capture: Capture) -> list[View]:
     """Up to VIEWS_SHOWN views, spread, of which both the capture and the result hold a photograph."""
     numbers = dict(zip(reconstruction.views, reconstruction.light_names, strict=True))
@@ -191,7 +209,7 @@ def _lights(reconstruction: Reconstruction, capture: Capture) -> str:
     if not spheres:
         return ""
     words = "<p>As the camera sees them; rings at 30, 60 and 90 degrees, areas are intensities, hollow ones are behind the object.</p>"
-    return _section("Lights", words + f'<div class="grid">{"".join(spheres)}</div>')
+    return _section("Lights", words + f'<div class="grid spheres">{"".join(spheres)}</div>')
 
 
 ROUND_COLUMNS = {
@@ -243,4 +261,6 @@ def _stages(stages: Sequence[Mapping[str, Any]]) -> str:
 
 def _settings(settings: Mapping[str, Any]) -> str:
     text = json.dumps(settings, indent=1, sort_keys=True, ensure_ascii=False)
-    return _section("Settings", f"<pre>{escape(text)}</pre>") if settings else ""
+    return (
+        _section("Settings", f"<details><summary>all options and versions</summary><pre>{escape(text)}</pre></details>") if settings else ""
+    )

@@ -14,14 +14,16 @@ from mvps.bounce import Sources
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.rendering import light_arriving, photograph, points_under, shadow_at
-from mvps.scene import Bool, Float, Reconstruction, View
+from mvps.scene import Bool, Float, Reconstruction, View, expected_error_deg
 from mvps.visibility import RayCaster
 
 LARGEST_SIDE = 360
-"""Pixels of a picture: sharp in one of two columns of a phone, and 28 of them stay far below the page's limit."""
+"""Pixels of a picture: sharp in one of two columns of a phone, and 32 of them stay far below the page's limit."""
 JPEG_QUALITY = 85
 ERROR_SPAN = 0.25
 """Error that is drawn brightest, as a share of the photograph's white."""
+EXPECTED_SPAN = 20.0
+"""Expected error of normals that is drawn brightest, degrees: twice what is of no use as a measurement (verdict.py)."""
 
 
 class Picture(NamedTuple):
@@ -55,6 +57,8 @@ def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Re
     error = np.abs(measured - rendered).mean(1) / white
     normals = points.normal @ view.camera.rotation.T @ DILIGENT_FROM_CAMERA
     shadow = np.where(attached, 0.45, np.where(cast, 0.0, 1.0))[:, None].repeat(3, 1)
+    known = points.confidence > 0
+    expected = np.where(known, expected_error_deg(np.where(known, points.confidence, 1.0)), EXPECTED_SPAN)
     mean_error = f"mean absolute error {100 * error.mean():.1f} % of white"
     rows: list[tuple[str, str, NDArray[np.uint8]]] = [
         ("photograph", "what the camera saw", srgb_bytes(measured / white)),
@@ -63,6 +67,11 @@ def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Re
         ("normals", "x red, y green, z to the camera blue", np.rint((normals + 1) * 127.5).clip(0, 255).astype(np.uint8)),
         ("albedo", "the colour without light and gloss", srgb_bytes(points.albedo / reflectance_scale(material))),
         ("specular", "the gloss of the re-rendering alone", srgb_bytes(specular / white)),
+        (
+            f"expected error of normals, white = {EXPECTED_SPAN:.0f} deg",
+            f"median {np.median(expected):.1f} deg; white too where no photograph shows the place",
+            _heat(expected / EXPECTED_SPAN),
+        ),
         ("shadow", "black: cast, grey: attached, white: lit", np.rint(shadow * 255).astype(np.uint8)),
     ]
     return f"light {view.lights[chosen]}", [
