@@ -190,25 +190,32 @@ def test_bunny_at_a_quarter_of_its_lights(captures: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("residuals", "turns"),
-    [((0.05,), 1), ((0.2, 0.08), 2), ((0.2, 0.15, 0.16), 3), ((0.25, 0.24, 0.23, 0.22, 0.21, 0.2, 0.19), MOST_TURNS)],
-    ids=["fits", "comes to fit", "stops falling", "keeps falling"],
+    ("residuals", "turned_deg", "turns"),
+    [
+        ((0.05,), (0.5,), 1),
+        ((0.2, 0.08), (3, 0.5), 2),
+        ((0.2, 0.15, 0.16), (3, 3, 3), 3),
+        ((0.25, 0.24, 0.23, 0.22, 0.21, 0.2, 0.19), 7 * (0.5,), MOST_TURNS),
+        ((0.05, 0.02, 0.01), (3.4, 1.3, 0.6), 3),
+    ],
+    ids=["fits", "comes to fit", "stops falling", "keeps falling", "fits under other lights"],
 )
-def test_stage_one_and_two_take_turns_while_the_model_fits_badly(
-    residuals: tuple[float, ...], turns: int, monkeypatch: pytest.MonkeyPatch
+def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
+    residuals: tuple[float, ...], turned_deg: tuple[float, ...], turns: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = iter(residuals)
+    made = iter(zip(residuals, turned_deg, strict=True))
     trained: list[int] = []
 
-    def refined(residual: float) -> SimpleNamespace:
-        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, rounds=[{"residual": residual, "vertex_change_px": 1.0}])
+    def refined(residual: float, turned: float) -> SimpleNamespace:
+        one = {"residual": residual, "light_change_deg": turned, "vertex_change_px": 1.0}
+        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, rounds=[one])
 
     def one(_: object, __: object, plan: OccupancySettings, *___: object) -> None:
         trained.append(plan.steps)
 
-    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined(next(made)))
+    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined(*next(made)))
     monkeypatch.setattr("mvps.reconstruct.stage_one", one)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    _, last, rounds = shaped(None, None, refined(0.3), Settings("somewhere"), True, None)  # type: ignore[arg-type]
+    _, last, rounds = shaped(None, None, refined(0.3, 5.0), Settings("somewhere"), True, None)  # type: ignore[arg-type]
     assert trained == [OccupancySettings().steps] + turns * [CONTINUED.steps]
     assert [r["residual"] for r in rounds] == [0.3, *residuals[:turns]] and last.rounds[0]["residual"] == residuals[turns - 1]

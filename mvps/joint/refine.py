@@ -62,6 +62,10 @@ MOSTLY = 0.5
 Four captures lie at 0.31 to 0.38 and 0.54 to 0.60 (docs/method.md)."""
 
 
+MOST_REPEATS = 2
+"""How often a round is done again whose vertices moved by more than its sweeps reach: what they look for may lie beyond."""
+
+
 @dataclass(frozen=True)
 class RoundSettings:
     """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
@@ -179,6 +183,7 @@ def refine(
     state = State(surface, lights, maps, law, settings.model)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
+    repeats = 0
     while pending:
         round_settings = pending.pop(0)
         state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
@@ -199,10 +204,15 @@ def refine(
             moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings, pixel)
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
+        again = changes["vertex_change_px"] > round_settings.reach and repeats < MOST_REPEATS
+        if again:
+            pending.insert(0, round_settings)
+            repeats += 1
         state.surface = moved
         if state.vertices is not None:
             carried = (moved, state.vertices)
-        before = round_settings
+        # What has moved so far is meshed anew.
+        before = None if again else round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
     return replace(finished(state, settings, account, device, generator), carried=carried)
