@@ -199,7 +199,12 @@ def test_capture_and_result_whose_names_are_no_text(capture: Path, tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("stage", "number"),
-    [("load", signal.SIGINT), ("joint refinement", signal.SIGINT), ("joint refinement", signal.SIGTERM), ("textures", signal.SIGHUP)],
+    [
+        ("load", signal.SIGINT),
+        ("joint refinement", signal.SIGINT),
+        ("joint refinement", signal.SIGTERM),
+        ("joint refinement", signal.SIGHUP),
+    ],
 )
 def test_an_interrupted_run(capture: Path, tmp_path: Path, stage: str, number: signal.Signals) -> None:
     out = tmp_path / "out"

@@ -142,7 +142,12 @@ def test_a_hull_that_is_good_enough_goes_without_the_occupancy_field() -> None:
 def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> None:
     """Their views would leave any hull where it is; Stage I runs all the same."""
     rough = SimpleNamespace(
-        lights=None, maps=(), law=None, carried=None, surface="hull", rounds=[{"residual": 0.01, "vertex_change_px": 0.0}]
+        lights=None,
+        maps=(),
+        law=None,
+        carried=None,
+        surface="hull",
+        rounds=[{"residual": 0.01, "light_change_deg": 0.0, "vertex_change_px": 0.0}],
     )
     monkeypatch.setattr("mvps.reconstruct.stage_one", lambda *_: "field")
     monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: rough)
