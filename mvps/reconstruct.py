@@ -132,8 +132,8 @@ def shaped(
 ) -> tuple[Surface, Refined, list[dict[str, float]]]:
     """Stage I and a round of Stage II on its surface in turn; Stage I's last surface, what Stage II last made, and its rounds.
 
-    Normals carve the field's hollows, and in a better carved hollow normals and lights are better: again while the model fits badly or lights
-    turn, as long as the residual falls. A hull that is good enough stays.
+    Normals carve the field's hollows, and in a better carved hollow normals and lights are better: again while the model fits badly or
+    lights turn, as long as the residual falls. A hull that is good enough stays.
     """
     from mvps.device import chosen_device
     from mvps.joint.pixels import OWN_LIGHTS
