@@ -20,7 +20,7 @@ import numpy as np
 from glb import Array, read_glb
 
 from mvps.export import read_reconstruction
-from mvps.illumination import Illumination
+from mvps.illumination import Illumination, frame_of
 from mvps.layers import rendered
 from mvps.load import read_capture
 from mvps.scene import Camera
@@ -76,12 +76,9 @@ def shine(direction: Array, intensity: Array) -> None:
     """Blender's sun as a directional light of ours (3,), (3,); a white body straight below returns intensity over pi."""
     sun = bpy.context.scene.objects["sun"]
     towards = BLENDER_FROM_GLTF[:3, :3] @ direction
-    helper = np.eye(3)[np.abs(towards).argmin()]
-    x = np.cross(helper, towards)
-    x /= np.linalg.norm(x)
     pose = np.eye(4)
     # A sun shines along its -z.
-    pose[:3, :3] = np.stack([x, np.cross(towards, x), towards], 1)
+    pose[:3, :3] = frame_of(towards)
     sun.matrix_world = matrix(pose)
     sun.data.energy, sun.data.color = float(intensity.max()), (intensity / intensity.max()).tolist()
 
