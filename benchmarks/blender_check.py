@@ -19,6 +19,7 @@ import cv2
 import numpy as np
 from glb import Array, read_glb
 
+from mvps.compare.tables import as_markdown
 from mvps.export import read_reconstruction
 from mvps.illumination import Illumination, frame_of
 from mvps.layers import rendered
@@ -125,12 +126,13 @@ def main() -> None:
     made.add_argument("paths", nargs="+", type=Path, metavar="RESULT CAPTURE")
     made.add_argument("--pictures", type=Path, metavar="DIR", help="ours, Blender's, four times their difference")
     given = made.parse_args()
-    lines = ["| result | views | against ours, dB | worst |", "|---|---|---|---|"]
+    if len(given.paths) % 2:
+        made.error("wanted pairs of a result and its capture, given an odd number of folders")
+    lines = [["result", "views", "against ours, dB", "worst"]]
     for result, capture in zip(given.paths[::2], given.paths[1::2], strict=True):
         with tempfile.TemporaryDirectory() as folder:
             found, shown = compared(result, capture, Path(folder))
-        lines.append(f"| {result.name} | {len(found)} | {np.mean(found):.1f} | {min(found):.1f} |")
-        print(lines[-1], flush=True)
+        lines.append([result.name, str(len(found)), f"{np.mean(found):.1f}", f"{min(found):.1f}"])
         if given.pictures:
             code = np.where(np.concatenate(shown) > 0, np.concatenate(shown), 0) ** (1 / 2.2)
             cv2.imwrite(str(given.pictures / f"{result.name}.png"), np.rint(255 * code[..., ::-1]).astype(np.uint8))
@@ -139,7 +141,9 @@ def main() -> None:
         f"Blender {bpy.app.version_string}, Cycles, {SAMPLES} rays a pixel, no bounces, one light of the capture; ours without"
         " inter-reflection. Peak is our brightest thousandth."
     )
-    (HERE / "blender.md").write_text(f"`{command}`: model.glb in Blender.\n\n" + "\n".join(lines) + f"\n\n{note}\n", encoding="utf-8")
+    text = f"`{command}`: model.glb in Blender.\n\n{as_markdown(lines)}\n\n{note}\n"
+    (HERE / "blender.md").write_text(text, encoding="utf-8")
+    print(text)
 
 
 if __name__ == "__main__":

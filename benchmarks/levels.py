@@ -17,6 +17,7 @@ from glb import Array, Model, read_glb
 from mitsuba_check import photographs, pictured, psnr
 from mitsuba_scene import mesh, render, sensor
 
+from mvps.compare.tables import as_markdown
 from mvps.export import read_reconstruction
 from mvps.load import read_capture, read_truth
 from mvps.measures import surface_errors
@@ -85,8 +86,7 @@ def main() -> None:
     parser.add_argument("result", type=Path)
     parser.add_argument("capture", type=Path)
     given = parser.parse_args()
-    rows = [[*HEAD, *TAIL], ["---"] * (len(HEAD) + len(TAIL)), *lines(given.result, given.capture)]
-    table = "\n".join("| " + " | ".join(row) + " |" for row in rows)
+    table = as_markdown([[*HEAD, *TAIL], *lines(given.result, given.capture)])
     text = f"`python benchmarks/levels.py RESULT CAPTURE`, {given.result.name}: levels of detail.\n\n{table}\n\n{NOTE}\n"
     (HERE / "levels.md").write_text(text, encoding="utf-8")
     print(text)

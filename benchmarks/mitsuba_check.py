@@ -20,6 +20,7 @@ from glb import Array, Model, read_glb, reflected, tangent_gap_deg
 from mitsuba_scene import mesh, render, sensor
 
 from mvps.camera import view_directions
+from mvps.compare.tables import as_markdown
 from mvps.export import read_reconstruction
 from mvps.illumination import Illumination
 from mvps.layers import rendered
@@ -160,9 +161,8 @@ def main() -> None:
     given = parser.parse_args()
     if len(given.paths) % 2:
         parser.error("wanted pairs of a result and its capture, given an odd number of folders")
-    lines = [[*HEAD, *TAIL], ["---"] * (len(HEAD) + len(TAIL))]
-    lines += [row(result, capture, given.pictures) for result, capture in zip(given.paths[::2], given.paths[1::2], strict=True)]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    pairs = zip(given.paths[::2], given.paths[1::2], strict=True)
+    table = as_markdown([[*HEAD, *TAIL], *(row(result, capture, given.pictures) for result, capture in pairs)])
     text = f"`python benchmarks/mitsuba_check.py RESULT CAPTURE ...`: model.glb in Mitsuba 3.\n\n{table}\n\n{NOTE}\n"
     (HERE / "mitsuba.md").write_text(text, encoding="utf-8")
     print(text)

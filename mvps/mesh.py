@@ -174,17 +174,17 @@ def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) 
     return largest_component(Surface(vertices, faces))
 
 
-def decimated(surface: Surface, faces: int) -> Surface:
-    """The surface with about `faces` faces, by collapsing edges (quadrics: Garland and Heckbert 1997).
+def decimated(surface: Surface, faces: int) -> Surface | None:
+    """The surface with about `faces` faces, by collapsing edges (quadrics: Garland and Heckbert 1997); as it is where it has no more.
 
-    As it is where it has no more, or where an edge has more than two faces, which collapsing cannot do with.
+    None where an edge has more than two faces, which collapsing cannot do with.
     """
     import igl
 
     if faces >= len(surface.faces):
         return surface
     vertices, fewer, *_ = igl.qslim(np.asfortranarray(surface.vertices), np.asfortranarray(surface.faces, np.int32), faces)
-    return Surface(vertices, fewer) if len(fewer) else surface
+    return Surface(vertices, fewer) if len(fewer) else None
 
 
 class Nearest(NamedTuple):

@@ -260,17 +260,19 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     from mvps.texture import bake
 
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    with progress.stage("textures"):
+    with progress.stage("textures") as stage:
         # A texel is seen by several views: their kept lights together determine its albedo several times over.
         part, lights = thinned(used, lights_of(reconstruction, used))
         density = TEXELS_PER_PIXEL[settings.preset]
         surface = reconstruction.surface
-        shells = [decimated(surface, faces) for faces in settings.faces]
-        textures, *levels = bake(surface, reconstruction.material, lights, part, density, shells)
+        shells = {faces: shell for faces in settings.faces if (shell := decimated(surface, faces)) is not None}
+        textures, *levels = bake(surface, reconstruction.material, lights, part, density, tuple(shells.values()))
+        if len(shells) < len(settings.faces):
+            stage.status("no models of fewer faces: the mesh has an edge of more than two")
     metrics = {**reconstruction.metrics, "stages": progress.stages}
     finished = replace(reconstruction, metrics=metrics)
     with progress.stage("report and files"):
-        write_reconstruction(finished, out, textures, report_html(finished, capture), dict(zip(settings.faces, levels, strict=True)))
+        write_reconstruction(finished, out, textures, report_html(finished, capture), dict(zip(shells, levels, strict=True)))
 
 
 def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Lights | None, resume: bool) -> Checkpoints:

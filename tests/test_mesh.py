@@ -85,15 +85,15 @@ def test_splitting_edges_keeps_a_mesh_closed_its_volume_and_its_orientation() ->
 def test_fewer_faces_stay_closed_and_near() -> None:
     ball = sphere(4)
     fewer = mesh.decimated(ball, 500)
-    assert len(fewer.faces) == 500 and is_closed(fewer)
+    assert fewer is not None and len(fewer.faces) == 500 and is_closed(fewer)
     assert np.abs(np.linalg.norm(fewer.vertices, axis=1) - 2).max() < 0.05
     assert signed_volume(fewer) > 0.97 * signed_volume(ball)
     assert mesh.decimated(ball, len(ball.faces)) is ball
 
 
-def test_an_edge_of_three_faces_keeps_its_surface() -> None:
+def test_an_edge_of_three_faces_is_not_decimated() -> None:
     fan = Surface(np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, -1, 0]]), np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]]))
-    assert mesh.decimated(fan, 1) is fan
+    assert mesh.decimated(fan, 1) is None
 
 
 def test_nearest_points_by_trimesh() -> None:
