@@ -32,19 +32,13 @@ from typing import Any
 import numpy as np
 
 from mvps.cores import at_a_time, on_cores
-from mvps.folders import appearing_whole
+from mvps.folders import CHECKPOINT, RESULT_MARKS, appearing_whole
 from mvps.gltf import glb_bytes, metallic_roughness
 from mvps.inputs import DAMAGED, JSON_LIMIT, check_npy, check_npz, parsed_json, read_file
 from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
 from mvps.texture import Textures, png_bytes
-
-RESULT_MARKS = ("settings.json", "mesh.ply")
-"""Files by which a folder is known as an earlier result, which may be replaced."""
-
-CHECKPOINT = "checkpoint"
-"""Folder in a result's place from which an interrupted run goes on (checkpoint.py)."""
 
 
 def write_reconstruction(

@@ -10,6 +10,12 @@ from pathlib import Path
 
 from mvps.scene import CaptureError
 
+RESULT_MARKS = ("settings.json", "mesh.ply")
+"""Files by which a folder is known as an earlier result, which may be replaced."""
+
+CHECKPOINT = "checkpoint"
+"""Folder in a result's place from which an interrupted run goes on (checkpoint.py)."""
+
 
 @contextmanager
 def appearing_whole(folder: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> Iterator[Path]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from mvps import __version__
 from mvps.finding import Finding
 from mvps.progress import Progress
-from mvps.scene import Capture, Lights, Reconstruction
+from mvps.scene import Capture, Lights, Reconstruction, View
 
 if TYPE_CHECKING:
     from mvps.device import Device
@@ -56,14 +56,15 @@ def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[
     import numpy as np
     from scipy.ndimage import distance_transform_edt
 
+    from mvps.cores import on_cores
     from mvps.joint.pixels import filled
     from mvps.rendering import points_under
     from mvps.visibility import ray_caster
 
     caster = ray_caster(refined.surface)
     own = {view.name: maps for view, maps in zip(used.views, refined.maps, strict=True)}
-    pictures = []
-    for view in capture.views:
+
+    def one(view: View) -> Any:
         points = points_under(caster, refined.material, view.camera, view.pixels)
         normal = filled(view, own[view.name], points.normal) if view.name in own else points.normal
         picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
@@ -72,8 +73,9 @@ def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[
             nearest = distance_transform_edt(np.isnan(picture[..., 0]), return_distances=False, return_indices=True)
             picture = picture[tuple(nearest)]
         picture[~view.mask] = np.nan
-        pictures.append(picture)
-    return tuple(pictures)
+        return picture
+
+    return tuple(on_cores(one, capture.views))
 
 
 def versions() -> dict[str, str]:

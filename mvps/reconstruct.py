@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
@@ -279,7 +280,7 @@ def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Ligh
     """Those of this run in its result's place."""
     from mvps.checkpoint import Checkpoints, fingerprint
     from mvps.device import chosen_device
-    from mvps.export import CHECKPOINT
+    from mvps.folders import CHECKPOINT
     from mvps.joint.blocks import Vertices
     from mvps.joint.refine import Refined
     from mvps.material import Trial
@@ -299,6 +300,14 @@ def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
         directions.append(reconstruction.lights.direction[at][rows])
         intensities.append(reconstruction.lights.intensity[at][rows])
     return Lights(tuple(directions), tuple(intensities), reconstruction.lights.one_rig)
+
+
+def load_libraries() -> None:
+    """What the stages are made of: 2 s on one core, while photographs are decoded outside the interpreter's lock."""
+    import mvps.joint.refine
+    import mvps.report
+    import mvps.sound
+    import mvps.texture  # noqa: F401
 
 
 FACES_HELP = "write models of about so many faces too (model_N.glb, model_N.obj), their detail in the normal map"
@@ -333,17 +342,15 @@ def main(argv: Sequence[str]) -> None:
         given.seed,
         given.faces,
     )
-    from mvps.export import CHECKPOINT, RESULT_MARKS
-    from mvps.folders import check_place
+    from mvps.folders import CHECKPOINT, RESULT_MARKS, check_place
     from mvps.load import read_calibrated_lights, read_capture
-    from mvps.sound import sound
 
     def before_decoding(sizes: list[tuple[int, int]]) -> None:
-        if given.max_memory is not None:
+        if given.max_memory is None:
+            Thread(target=load_libraries).start()
+        else:
             # What the program takes is known once its libraries are there.
-            import mvps.joint.refine
-            import mvps.texture  # noqa: F401
-
+            load_libraries()
             keep_below(given.max_memory, 1e6 * peak_memory_mb(), sizes, given.preset)
 
     check_place(given.out.resolve(), RESULT_MARKS, CHECKPOINT)
@@ -351,6 +358,8 @@ def main(argv: Sequence[str]) -> None:
     with progress.stage("load") as stage:
         capture = read_capture(given.capture, given.views or None, given.lights or None, before_decoding)
         stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
+    from mvps.sound import sound
+
     capture, findings = sound(capture, progress)
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     lights = read_calibrated_lights(given.capture, used) if given.calibrated_lights else None

@@ -129,7 +129,7 @@ def _pairs(view: View, caster: RayCaster, among: Bool | None = None) -> tuple[In
 def visible_in(capture: Capture, surface: Surface) -> list[tuple[Int, Float]]:
     """Per view the vertices that it sees (n,) and the weight of each pair (n,)."""
     caster = ray_caster(surface)
-    return [_pairs(view, caster)[:2] for view in capture.views]
+    return on_cores(lambda view: _pairs(view, caster)[:2], capture.views)
 
 
 def observe(

@@ -81,18 +81,21 @@ def _slopes(normal: Tensor, plane: Tensor, basis: Tensor) -> tuple[Tensor, Tenso
 
 def _drawn(seen: Int, surface: Surface, normal: Float, count: int, size: int, generator: np.random.Generator) -> Int:
     """(V,) patch of each vertex, -1 outside of all; all -1 where the mesh has no piece of `size` vertices with one side."""
-    tree = cKDTree(surface.vertices[seen])
-    near = seen[tree.query(surface.vertices[seen], k=np.arange(1, min(2 * size, len(seen)) + 1))[1]]
+    tree, wanted = cKDTree(surface.vertices[seen]), -(-count // size)
     patch, number = np.full(len(normal), -1), 0
-    for row in generator.permutation(len(seen)):
-        if number * size >= count:
-            break
-        around = near[row]
-        around = around[(patch[around] < 0) & (normal[around] @ normal[seen[row]] > SAME_SIDE)][:size]
-        # What other patches have left over is no piece of surface.
-        if len(around) == size:
-            patch[around] = number
-            number += 1
+    order = generator.permutation(len(seen))
+    # Neighbours of no more vertices than it takes: few of them begin a patch.
+    for start in range(0, len(order), wanted):
+        rows = order[start : start + wanted]
+        near = seen[tree.query(surface.vertices[seen[rows]], k=np.arange(1, min(2 * size, len(seen)) + 1))[1]]
+        for row, around in zip(rows, near, strict=True):
+            if number == wanted:
+                return patch
+            around = around[(patch[around] < 0) & (normal[around] @ normal[seen[row]] > SAME_SIDE)][:size]
+            # What other patches have left over is no piece of surface.
+            if len(around) == size:
+                patch[around] = number
+                number += 1
     return patch
 
 

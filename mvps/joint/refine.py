@@ -15,6 +15,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from mvps.camera import pixel_footprint
+from mvps.cores import at_a_time
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
@@ -153,7 +154,7 @@ def _remeshed(
         surface = isotropic_remesh(surface, settings.edge * pixel)
     if carried is None or not np.isfinite(settings.crease):
         return surface, 0.0
-    nearest = cKDTree(carried[0].vertices).query(surface.vertices)[1]
+    nearest = cKDTree(carried[0].vertices).query(surface.vertices, workers=at_a_time())[1]
     normal = carried[1].normal.double().cpu().numpy()[nearest]
     ends = normal[edges(surface)]
     creased = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > settings.crease
