@@ -43,7 +43,7 @@ captures, docs/method.md), so it would do no better."""
 
 MOVING_DEG = 1.0
 """Mean turn of the lights in a round from which on the field has seen other lights than there are: wrong by a degree, they bend normals by
-as much. Where the model fits, lights of nine captures turned by 0.06 to 0.9 deg, and by 3.4 where four views of 512 x 512 leave the hull
+as much. Where the model fits, lights of eight captures turned by 0.06 to 0.9 deg, and by 3.4 where four views of 512 x 512 leave the hull
 8 pixels off (docs/method.md)."""
 
 MOST_TURNS = 6
@@ -128,6 +128,13 @@ def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySett
         return field.trained(maps, plan, lambda _, loss: stage.advance(1, loss=loss))
 
 
+def few_lights(capture: Capture) -> bool:
+    """Whether a view has fewer lights than tell normals of its own."""
+    from mvps.joint.pixels import OWN_LIGHTS
+
+    return min(len(view.lights) for view in capture.views) < OWN_LIGHTS
+
+
 def shaped(
     capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
 ) -> tuple[Surface, Refined, list[dict[str, float]]]:
@@ -137,14 +144,13 @@ def shaped(
     lights turn, as long as the residual falls. A hull that is good enough stays.
     """
     from mvps.device import chosen_device
-    from mvps.joint.pixels import OWN_LIGHTS
     from mvps.material import POOR_FIT
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
 
     rounds, shift = list(rough.rounds), rough.rounds[0]["vertex_change_px"]
     words = f"views moved the hull by {shift:.2f} px"
     # Of fewer lights a view's normals say nothing of their own, and nothing asks the hull to move.
-    if shift < GOOD_HULL and min(len(view.lights) for view in capture.views) >= OWN_LIGHTS:
+    if shift < GOOD_HULL and not few_lights(capture):
         with progress.stage("occupancy field") as stage:
             stage.status(f"skipped: {words}, less than {GOOD_HULL} px")
         return rough.surface, rough, rounds
@@ -244,7 +250,7 @@ def reconstruct(
         turns = parts.of(between_passes(free))
         surface, between, rounds = step("shape", lambda: shaped(used, grid, rough, settings, turns, progress))
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        plan = parts.of(last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT))
+        plan = parts.of(last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT, few_lights(used)))
         refined = refined_by("joint refinement", plan, surface, between, between.carried)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)

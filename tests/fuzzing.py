@@ -77,10 +77,13 @@ class Target:
     read: Callable[[Path], Any]
 
     def tried(self, name: str, by: Sequence[Edit], seal: bool) -> str:
-        """Reads the folder with one file changed; "value" or the refusal's text. The file is as it was afterwards."""
+        """Reads the folder with one file changed by edits; "value" or the refusal's text."""
+        return self.holding(name, changed((self.root / name).read_bytes(), by), seal)
+
+    def holding(self, name: str, data: bytes, seal: bool) -> str:
+        """Reads the folder with other data in a file; "value" or the refusal's text. The file is as it was afterwards."""
         path = self.root / name
         good = path.read_bytes()
-        data = changed(good, by)
         path.write_bytes(sealed(data) if seal and name.endswith(".png") else data)
         try:
             self.read(self.root)

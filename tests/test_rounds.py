@@ -1,4 +1,4 @@
-"""mvps.joint.refine: a round whose vertices moved farther than its sweeps reach is done again, others are not."""
+"""mvps.joint.refine: a round whose vertices moved farther than its sweeps reach, or than it allows, is done again, others are not."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def scene() -> SphereScene:
     return make_sphere(3)
 
 
-def swollen(scene: SphereScene, pixels: float) -> tuple[list[float], float]:
+def swollen(scene: SphereScene, pixels: float, still: float = np.inf) -> tuple[list[float], float]:
     """From a surface that many pixels too large: the vertices' mean change in every round, and the error of the radius, in pixels."""
     surface, device = scene.reconstruction.surface, torch.device("cpu")
     lights = scene.reconstruction.lights
     pixel = pixel_footprint([view.camera for view in scene.capture.views], np.zeros(3))
     start = Surface(surface.vertices * (1 + pixels * pixel / RADIUS), surface.faces)
     maps = normal_maps(scene.capture, lights, device)
-    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4),), free_lights=False)
+    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=still),), free_lights=False)
     refined = refine(scene.capture, start, lights, maps, Law((8.0,)), plan, 0, device, lambda *_: None)
     radius = np.linalg.norm(refined.surface.vertices, axis=1)
     return [one["vertex_change_px"] for one in refined.rounds], float(np.abs(radius - RADIUS).mean() / pixel)
@@ -45,3 +45,9 @@ def test_a_round_is_done_again_where_vertices_moved_far(scene: SphereScene, monk
 def test_a_round_that_found_its_place_is_the_last(scene: SphereScene) -> None:
     changes, _ = swollen(scene, 0.5)
     assert len(changes) == 1
+
+
+def test_a_round_is_done_again_until_vertices_are_still(scene: SphereScene) -> None:
+    (first,), _ = swollen(scene, 0.5)
+    changes, _ = swollen(scene, 0.5, still=0.9 * first)
+    assert changes[0] == first and len(changes) == 2 and changes[1] <= 0.9 * first

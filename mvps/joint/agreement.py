@@ -15,7 +15,8 @@ deviation:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -48,6 +49,21 @@ class Agreement:
     offset: Float
     sigma: Float
 
+    def weight(self, floor: float) -> Float:
+        """(V,) inverse variance, with a standard deviation of at least `floor`; 0 where nothing is known."""
+        return np.where(np.isfinite(self.sigma), 1 / np.maximum(self.sigma, floor) ** 2, 0)
+
+    @staticmethod
+    def of_weights(weight: Float, pull: Float) -> Agreement:
+        """From inverse variances (V,) and offsets times these (V,)."""
+        safe = np.where(weight > 0, weight, 1)
+        return Agreement(pull / safe, np.where(weight > 0, 1 / np.sqrt(safe), np.inf))
+
+    def joined(self, other: Agreement, floor: float) -> Agreement:
+        """Both together; floor: the smallest standard deviation of either."""
+        own, others = self.weight(floor), other.weight(floor)
+        return Agreement.of_weights(own + others, own * self.offset + others * other.offset)
+
 
 def feature_image(maps: NormalMap, mask: NDArray[np.bool_], index: Int) -> NDArray[np.float32]:
     """(height, width, 4) albedo-scaled normal times confidence, and confidence, 0 in the background."""
@@ -74,8 +90,8 @@ def _facing(view: View, points: Float, normal: Float) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Swept:
-    """What a view says of n vertices of a block: their rows (n,), squared cosine (n,); weight (n, offsets), b (3, n, offsets)."""
+class Swept:
+    """What a view says of n vertices: their numbers (n,), squared cosine (n,); weight (n, offsets), b (3, n, offsets)."""
 
     rows: Int
     facing: NDArray[np.float32]
@@ -89,30 +105,43 @@ def agreement(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], s
     normal = vertex_normals(surface)
     images = on_cores(lambda view, of: feature_image(of, view.mask, view.pixel_index), capture.views, maps)
 
-    def of_block(start: int) -> Agreement:
-        stop = min(start + VERTICES_AT_ONCE, len(normal))
-        swept = []
-        for view, image, index in zip(capture.views, images, seen, strict=True):
-            among = index[slice(*np.searchsorted(index, (start, stop)))]
-            if len(among):
-                swept.append(_swept(view, image, surface.vertices[among], normal[among], offsets, among - start))
-        return _lowest(*_costs(swept, stop - start, len(offsets)), offsets)
+    def reports(i: int, some: slice) -> list[Swept]:
+        vertex = seen[i][some]
+        return swept(capture.views[i], [images[i]], surface.vertices[vertex], normal[vertex], offsets, vertex)
 
-    blocks = on_cores(of_block, range(0, len(normal), VERTICES_AT_ONCE))
+    return lowest_of(len(normal), reports, seen, offsets)
+
+
+def lowest_of(count: int, reports: Callable[[int, slice], list[Swept]], seen: list[Int], offsets: Float) -> Agreement:
+    """Where each of `count` vertices agrees best. reports(i, some): what view i says of `some` of seen[i], its vertices in order."""
+
+    def of_block(start: int) -> Agreement:
+        stop, found = min(start + VERTICES_AT_ONCE, count), []
+        for i, index in enumerate(seen):
+            some = slice(*(int(k) for k in np.searchsorted(index, (start, stop))))
+            if some.start < some.stop:
+                found += [replace(of, rows=of.rows - start) for of in reports(i, some)]
+        return _lowest(*_costs(found, stop - start, len(offsets)), offsets)
+
+    blocks = on_cores(of_block, range(0, count, VERTICES_AT_ONCE))
     return Agreement(np.concatenate([block.offset for block in blocks]), np.concatenate([block.sigma for block in blocks]))
 
 
-def _swept(view: View, image: NDArray[np.float32], points: Float, normal: Float, offsets: Float, rows: Int) -> _Swept:
+def swept(view: View, images: Sequence[NDArray[np.float32]], points: Float, normal: Float, offsets: Float, rows: Int) -> list[Swept]:
+    """What images (height, width, 4) of b times weight, and weight, each say of points (n, 3) along their normals (n, 3)."""
     facing = _facing(view, points, normal)
     step = max(1, REMAP_LIMIT // len(offsets))
     starts = range(0, len(points), step)
     places = [_slid(view.camera, points[k : k + step], normal[k : k + step], offsets) for k in starts]
-    value = np.concatenate([sampled(image, place, cv2.BORDER_CONSTANT) for place in places])
-    *b, confidence = np.ascontiguousarray(value.reshape(-1, 4).T).reshape(4, len(points), len(offsets))
-    return _Swept(rows, facing, confidence * facing[:, None], np.stack(b) / np.maximum(confidence, 1e-6))
+    found = []
+    for image in images:
+        value = np.concatenate([sampled(image, place, cv2.BORDER_CONSTANT) for place in places])
+        *b, confidence = np.ascontiguousarray(value.reshape(-1, 4).T).reshape(4, len(points), len(offsets))
+        found.append(Swept(rows, facing, confidence * facing[:, None], np.stack(b) / np.maximum(confidence, 1e-6)))
+    return found
 
 
-def _costs(swept: list[_Swept], count: int, offsets: int) -> tuple[Float, NDArray[np.bool_], Float]:
+def _costs(swept: list[Swept], count: int, offsets: int) -> tuple[Float, NDArray[np.bool_], Float]:
     """c (count, offsets), which vertices (count,) the views say something about, and by how many views (count,), effectively."""
     facing, facing2 = np.zeros(count), np.zeros(count)
     total, square = np.zeros((2, count, offsets), np.float32)
@@ -129,9 +158,11 @@ def _costs(swept: list[_Swept], count: int, offsets: int) -> tuple[Float, NDArra
     mean /= safe
     square /= safe
     variance = np.maximum(square - (mean**2).sum(0), ROUNDING**2 * square + np.finfo(np.float32).tiny)
-    unit = (CHANNELS / (CAUCHY_95**2 * variance.min(1))).astype(np.float32)
+    # Where a vertex slides out of all pictures they do not differ, which says nothing.
+    least = np.where(total > 0, variance, variance.max(1, keepdims=True)).min(1)
+    unit = (CHANNELS / (CAUCHY_95**2 * least)).astype(np.float32)
 
-    def apart(of: _Swept) -> NDArray[np.float32]:
+    def apart(of: Swept) -> NDArray[np.float32]:
         """|b - m|^2 / s^2."""
         squared = np.zeros_like(of.weight)
         for sums, b in zip(mean, of.b, strict=True):

@@ -22,6 +22,7 @@ from mvps.joint.colours import colours, lobes_in_colour
 from mvps.joint.fused import face_targets
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
+from mvps.joint.photoconsistency import photoconsistency
 from mvps.joint.photometry import (
     TRIAL_VERTICES,
     WEAK_TIE,
@@ -37,6 +38,7 @@ from mvps.joint.photometry import (
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
+from mvps.joint.thinned import ENOUGH_LIGHTS
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
@@ -82,6 +84,7 @@ class RoundSettings:
     crease: float = np.inf
     for_detail: bool = False
     fusions: int = 3
+    still: float = np.inf
 
     def offsets(self) -> Float:
         """Offsets of the sweep, pixels."""
@@ -122,6 +125,23 @@ class Refined:
     carried: tuple[Surface, Vertices] | None = None
 
 
+def _agreed(surface: Surface, start: Float, state: State, capture: Capture, seen: list[Any], offsets: Float, pixel: float) -> Agreement:
+    """Where views agree that vertices of the surface lie, which were at start (V, 3) before this round moved them."""
+    fewest = min(len(view.lights) for view in capture.views)
+    if fewest < OWN_LIGHTS:
+        # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
+        back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
+        agreed = Agreement(back, np.full(len(back), pixel))
+    else:
+        agreed = agreement(capture, surface, state.maps, seen, offsets)
+    if fewest >= ENOUGH_LIGHTS or state.vertices is None or state.under is None:
+        return agreed
+    photographs, lights = state.under
+    grey = grey_lights(lights, state.vertices.normal.device)
+    observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
+    return agreed.joined(photoconsistency(observed, lights, surface, offsets, OWN_LIGHTS), POSITION_FLOOR_PIXELS * pixel)
+
+
 def _moved(
     surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
 ) -> Surface:
@@ -131,12 +151,7 @@ def _moved(
     distance = mask_distances(capture)
     factor, start = None, surface.vertices
     for _ in range(settings.fusions):
-        if min(len(view.lights) for view in capture.views) < OWN_LIGHTS:
-            # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
-            back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
-            agreed = Agreement(back, np.full(len(back), pixel))
-        else:
-            agreed = agreement(capture, surface, state.maps, seen, settings.offsets() * pixel)
+        agreed = _agreed(surface, start, state, capture, seen, settings.offsets() * pixel, pixel)
         agreed = with_masks(agreed, capture, surface, distance, floor)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
@@ -205,7 +220,8 @@ def refine(
             moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings, pixel)
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
-        again = changes["vertex_change_px"] > round_settings.reach and repeats < MOST_REPEATS
+        far = changes["vertex_change_px"] > round_settings.reach
+        again = (far or changes["vertex_change_px"] > round_settings.still) and repeats < MOST_REPEATS
         if again:
             pending.insert(0, round_settings)
             repeats += 1
@@ -213,7 +229,7 @@ def refine(
         if state.vertices is not None:
             carried = (moved, state.vertices)
         # What has moved so far is meshed anew.
-        before = None if again else round_settings
+        before = None if far and again else round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
     return replace(finished(state, settings, account, device, generator), carried=carried)

@@ -66,11 +66,8 @@ def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: 
         return weights.astype(np.float64), pulls.astype(np.float64)
 
     weight, pull = (sum(parts) for parts in zip(*on_cores(of_view, range(len(capture.views))), strict=True))
-    known = np.isfinite(agreed.sigma)
-    own = np.where(known, 1 / np.maximum(agreed.sigma, floor) ** 2, 0)
-    total = own + weight
-    safe = np.where(total > 0, total, 1)
-    return Agreement((own * agreed.offset + pull) / safe, np.where(total > 0, 1 / np.sqrt(safe), np.inf))
+    own = agreed.weight(floor)
+    return Agreement.of_weights(own + weight, own * agreed.offset + pull)
 
 
 def turned(source: Float, target: Float, vectors: Float) -> Float:

@@ -1,0 +1,85 @@
+"""Where single photographs of a textured ball agree, a light a view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from sphere_scene import RADIUS, make_sphere
+
+from mvps.joint.agreement import Agreement
+from mvps.joint.blocks import Vertices
+from mvps.joint.observe import observe
+from mvps.joint.photoconsistency import photoconsistency
+from mvps.joint.photometry import grey_lights
+from mvps.joint.reflectance import Observed
+from mvps.rendering import photograph
+from mvps.scene import Capture, Lights, Material, Surface
+from mvps.visibility import RayCaster
+
+CPU = torch.device("cpu")
+TOO_SMALL = 0.8
+OFFSETS = np.arange(-2.0, 2.01, 0.25)
+
+
+def photographed(material: Material, lights: int) -> tuple[Capture, Lights, Surface]:
+    """A ball of this material from twelve directions, under so many lights a view, others in each."""
+    scene = make_sphere(subdivisions=5, seen_from=trimesh.creation.icosahedron().vertices)
+    surface, rig = scene.reconstruction.surface, scene.reconstruction.lights
+    caster, views, directions, intensities = RayCaster(surface), [], [], []
+    for i, view in enumerate(scene.capture.views):
+        some = [(i + k) % 10 for k in range(lights)]
+        direction, intensity = rig.direction[i][some], rig.intensity[i][some]
+        radiance = photograph(caster, material, view.camera, view.pixels, direction, intensity)
+        samples = np.rint((radiance / 2).clip(0, 1) * 65535).astype(np.uint16)
+        views.append(replace(view, samples=samples, lights=tuple(k + 1 for k in some)))
+        directions.append(direction)
+        intensities.append(intensity)
+    return Capture("ball", tuple(views)), Lights(tuple(directions), tuple(intensities), False), surface
+
+
+def painted(texture: float) -> Material:
+    """Of a ball: one lobe, and an albedo that waves by this part along all axes."""
+    ball = make_sphere(subdivisions=5).reconstruction.surface
+    outward = ball.vertices / RADIUS
+    waves = np.sin(ball.vertices[:, [1, 2, 0]] / 2).prod(1)[:, None] * np.array([1.0, 0.5, -0.5])
+    return Material(outward, 0.5 * (1 + texture * waves), np.full((len(outward), 1), 0.1), np.array([20.0]), np.ones(len(outward)))
+
+
+def agreed(capture: Capture, lights: Lights, surface: Surface, material: Material) -> Agreement:
+    """Of a ball that is too small, by at most four photographs a view."""
+    small = Surface(surface.vertices * (1 - TOO_SMALL / RADIUS), surface.faces)
+    reflectance = np.column_stack([material.albedo.mean(1), material.specular_weight])
+    normal, values = (torch.tensor(a, dtype=torch.float32) for a in (material.normal, reflectance))
+    vertices = Vertices(normal, values, 0.1 * values[:, 0])
+    of = Observed(capture, small, observe(capture, small, lights, CPU), vertices, grey_lights(lights, CPU), material.law)
+    return photoconsistency(of, lights, small, OFFSETS, 4)
+
+
+@pytest.mark.parametrize("texture", [0.0, 0.8])
+@pytest.mark.parametrize("lights", [1, 2, 6])
+def test_photographs_agree_where_the_surface_is(texture: float, lights: int) -> None:
+    material = painted(texture)
+    found = agreed(*photographed(material, lights), material)
+    told = np.isfinite(found.sigma)
+    assert told.mean() > 0.8 and abs(np.median(found.offset[told]) - TOO_SMALL) < 0.05
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_photographs_without_a_usable_value_say_nothing() -> None:
+    material = painted(0.8)
+    capture, lights, surface = photographed(material, 1)
+    dazzled = Capture("dazzled", tuple(replace(view, saturation=0) for view in capture.views))
+    found = agreed(dazzled, lights, surface, material)
+    assert np.isinf(found.sigma).all() and not found.offset.any()
+
+
+def test_together_the_surer_decides_and_what_is_unknown_does_not() -> None:
+    known = Agreement(np.array([1.0, 1.0, 0.0]), np.array([0.1, 0.01, np.inf]))
+    other = Agreement(np.array([2.0, 2.0, 0.0]), np.array([0.1, 1.0, np.inf]))
+    both = known.joined(other, 0.05)
+    assert np.allclose(both.offset[:2], [1.5, (400 + 2) / 401]) and np.allclose(both.sigma[:2], [0.1 / 2**0.5, 401**-0.5])
+    assert both.offset[2] == 0 and np.isinf(both.sigma[2])
