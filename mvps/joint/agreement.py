@@ -39,6 +39,9 @@ VERTICES_AT_ONCE = 8192
 ROUNDING = 1e-4
 """Least s over the length of b: float32 knows differences no better."""
 
+LEAST_VARIANCE = np.float32(1e-30)
+"""Of b, where all views see black: (1e-15 of white)^2, over which float32 holds a square of 1e4."""
+
 CHANNELS = 3
 
 
@@ -157,10 +160,8 @@ def _costs(swept: list[Swept], count: int, offsets: int) -> tuple[Float, NDArray
     safe = np.maximum(total, np.float32(1e-9))
     mean /= safe
     square /= safe
-    variance = np.maximum(square - (mean**2).sum(0), ROUNDING**2 * square + np.finfo(np.float32).tiny)
-    # Where a vertex slides out of all pictures they do not differ, which says nothing.
-    least = np.where(total > 0, variance, variance.max(1, keepdims=True)).min(1)
-    unit = (CHANNELS / (CAUCHY_95**2 * least)).astype(np.float32)
+    variance = np.maximum(square - (mean**2).sum(0), ROUNDING**2 * square + LEAST_VARIANCE)
+    unit = (CHANNELS / (CAUCHY_95**2 * variance.min(1))).astype(np.float32)
 
     def apart(of: Swept) -> NDArray[np.float32]:
         """|b - m|^2 / s^2."""

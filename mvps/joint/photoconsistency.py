@@ -1,4 +1,4 @@
-"""Where photographs agree: offsets of vertices along their normals, for views of few lights.
+"""Where photographs agree: offsets of vertices along their normals, for views of too few lights for normals of their own.
 
 As agreement.py, but what a view reports of a vertex x that slides along its normal is the albedo that single photographs show there:
 
@@ -6,8 +6,8 @@ As agreement.py, but what a view reports of a vertex x that slides along its nor
 
 J is radiance over the light's colour, P what the vertex's lobes reflect and q = dI/da the light on it (blocks.py): both are of the vertex
 as it is, and do not slide. Weights are the squared cosine of the viewing angle times q^2, the inverse variance of b under image noise.
-On the surface all photographs show one albedo; beside it they show its texture apart (photo-consistency: Seitz and Dyer 1999). Fewer than
-three lights give no normals that could agree, and with few their noise hides what photographs tell.
+On the surface all photographs show one albedo; beside it they show texture and shading of other places (photo-consistency: Seitz and Dyer
+1999).
 """
 
 from __future__ import annotations
@@ -37,14 +37,13 @@ def radiance_image(view: View, light: int, ratio: Float) -> NDArray[np.float32]:
     return image
 
 
-def photoconsistency(of: Observed, lights: Lights, surface: Surface, offsets: Float, most: int) -> Agreement:
+def photoconsistency(of: Observed, lights: Lights, surface: Surface, offsets: Float) -> Agreement:
     """Where along its normal each vertex shows one albedo. lights: of the photographs of `of`; surface: that of `of`, perhaps moved since;
-    offsets (n,) evenly spaced, world units; most: photographs of a view that take part, evenly chosen."""
+    offsets (n,) evenly spaced, world units."""
     normal, seen = vertex_normals(surface), [samples.vertex.cpu().numpy() for samples in of.views]
-    chosen = [np.unique(np.arange(most) * len(view.lights) // most) for view in of.capture.views]
     images = [
-        [radiance_image(view, k, channel_ratio(intensity)[k]) for k in some]
-        for view, intensity, some in zip(of.capture.views, lights.intensity, chosen, strict=True)
+        [radiance_image(view, k, ratio) for k, ratio in enumerate(channel_ratio(intensity))]
+        for view, intensity in zip(of.capture.views, lights.intensity, strict=True)
     ]
 
     def reports(i: int, some: slice) -> list[Swept]:
@@ -52,9 +51,9 @@ def photoconsistency(of: Observed, lights: Lights, surface: Surface, offsets: Fl
         index = samples.vertex[some]
         reflectance = of.vertices.reflectance[index]
         shaded = evaluate(of.vertices.normal[index], reflectance, samples.towards[some], of.lights[i], of.law, samples.gathered_of(some))
-        lobes = (shaded.predicted - reflectance[:, :1] * shaded.basis[0]).cpu().numpy()[:, chosen[i]]
-        q, level = (a.cpu().numpy()[..., chosen[i]] for a in (shaded.basis[0], of.lights[i].intensity))
-        lit = (q > FAINTEST_LIGHT * level) & samples.data[some].cpu().numpy()[:, chosen[i]]
+        lobes = (shaded.predicted - reflectance[:, :1] * shaded.basis[0]).cpu().numpy()
+        q, level = (a.cpu().numpy() for a in (shaded.basis[0], of.lights[i].intensity))
+        lit = (q > FAINTEST_LIGHT * level) & samples.data[some].cpu().numpy()
         weight, safe = np.where(lit, (q / level) ** 2, 0), np.where(lit, q, 1)
         found = swept(of.capture.views[i], images[i], surface.vertices[vertex], normal[vertex], offsets, vertex)
         return [

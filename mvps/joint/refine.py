@@ -38,7 +38,6 @@ from mvps.joint.photometry import (
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
-from mvps.joint.thinned import ENOUGH_LIGHTS
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
@@ -127,19 +126,16 @@ class Refined:
 
 def _agreed(surface: Surface, start: Float, state: State, capture: Capture, seen: list[Any], offsets: Float, pixel: float) -> Agreement:
     """Where views agree that vertices of the surface lie, which were at start (V, 3) before this round moved them."""
-    fewest = min(len(view.lights) for view in capture.views)
-    if fewest < OWN_LIGHTS:
-        # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
-        back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
-        agreed = Agreement(back, np.full(len(back), pixel))
-    else:
-        agreed = agreement(capture, surface, state.maps, seen, offsets)
-    if fewest >= ENOUGH_LIGHTS or state.vertices is None or state.under is None:
+    if min(len(view.lights) for view in capture.views) >= OWN_LIGHTS:
+        return agreement(capture, surface, state.maps, seen, offsets)
+    # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
+    back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
+    agreed = Agreement(back, np.full(len(back), pixel))
+    if state.vertices is None:
         return agreed
-    photographs, lights = state.under
-    grey = grey_lights(lights, state.vertices.normal.device)
-    observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
-    return agreed.joined(photoconsistency(observed, lights, surface, offsets, OWN_LIGHTS), POSITION_FLOOR_PIXELS * pixel)
+    grey = grey_lights(state.lights, state.vertices.normal.device)
+    observed = Observed(capture, state.surface, state.views, state.vertices, grey, state.law)
+    return agreed.joined(photoconsistency(observed, state.lights, surface, offsets), POSITION_FLOOR_PIXELS * pixel)
 
 
 def _moved(
