@@ -351,12 +351,13 @@ def main(argv: Sequence[str]) -> None:
     from mvps.folders import CHECKPOINT, RESULT_MARKS, check_place
     from mvps.load import read_calibrated_lights, read_capture
 
+    libraries = Thread(target=load_libraries)
+
     def before_decoding(sizes: list[tuple[int, int]]) -> None:
-        if given.max_memory is None:
-            Thread(target=load_libraries).start()
-        else:
+        libraries.start()
+        if given.max_memory is not None:
             # What the program takes is known once its libraries are there.
-            load_libraries()
+            libraries.join()
             keep_below(given.max_memory, 1e6 * peak_memory_mb(), sizes, given.preset)
 
     check_place(given.out.resolve(), RESULT_MARKS, CHECKPOINT)
@@ -364,6 +365,8 @@ def main(argv: Sequence[str]) -> None:
     with progress.stage("load") as stage:
         capture = read_capture(given.capture, given.views or None, given.lights or None, before_decoding)
         stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
+        # Not by an import: interrupted in one, it would leave the other thread waiting for ever.
+        libraries.join()
     from mvps.sound import sound
 
     capture, findings = sound(capture, progress)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,15 @@ def test_too_few_addresses_are_refused_before_numpy_is_there() -> None:
         assert result.stderr.startswith("mvps: memory: wanted at least")
 
 
+@pytest.fixture
+def interruptible() -> Iterator[None]:
+    """Ctrl-C as at a terminal: what a shell starts in the background ignores it, and so would what the tests start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interruption_while_loading_leaves_no_trace() -> None:
     with loading():
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
@@ -136,6 +146,7 @@ def test_a_full_disk_while_checkpoints_are_written(capture: Path, tmp_path: Path
 
 WRITING_A_FOLDER = """
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from mvps.folders import appearing_whole
 with appearing_whole(Path(sys.argv[1])) as writing:
@@ -197,6 +208,7 @@ def test_capture_and_result_whose_names_are_no_text(capture: Path, tmp_path: Pat
 # ------------------------------------------------------------------------------------------------ interruptions
 
 
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize(
     ("stage", "number"),
     [
