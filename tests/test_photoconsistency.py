@@ -60,7 +60,7 @@ def agreed(capture: Capture, lights: Lights, surface: Surface, material: Materia
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.8])
-@pytest.mark.parametrize("lights", [1, 2, 3])
+@pytest.mark.parametrize("lights", [1, 2, 3, 7])
 def test_photographs_agree_where_the_surface_is(texture: float, lights: int) -> None:
     material = painted(texture)
     found = agreed(*photographed(material, lights), material)

@@ -24,6 +24,9 @@ from mvps.joint.reflectance import Observed
 from mvps.mesh import vertex_normals
 from mvps.scene import Float, Lights, Surface, View
 
+MOST = 3
+"""Photographs of a view that take part, spread over its lights: of more, normals would tell (pixels.py)."""
+
 FAINTEST_LIGHT = 0.05
 """Of a light's mean intensity: with less on a vertex (87 degrees) the albedo is noise."""
 
@@ -41,9 +44,10 @@ def photoconsistency(of: Observed, lights: Lights, surface: Surface, offsets: Fl
     """Where along its normal each vertex shows one albedo. lights: of the photographs of `of`; surface: that of `of`, perhaps moved since;
     offsets (n,) evenly spaced, world units."""
     normal, seen = vertex_normals(surface), [samples.vertex.cpu().numpy() for samples in of.views]
+    chosen = [np.unique(np.arange(MOST) * len(view.lights) // MOST) for view in of.capture.views]
     images = [
-        [radiance_image(view, k, ratio) for k, ratio in enumerate(channel_ratio(intensity))]
-        for view, intensity in zip(of.capture.views, lights.intensity, strict=True)
+        [radiance_image(view, k, channel_ratio(intensity)[k]) for k in some]
+        for view, intensity, some in zip(of.capture.views, lights.intensity, chosen, strict=True)
     ]
 
     def reports(i: int, some: slice) -> list[Swept]:
@@ -63,7 +67,7 @@ def photoconsistency(of: Observed, lights: Lights, surface: Surface, offsets: Fl
                 weight=one.weight * weight[:, k, None],
                 b=lit[:, k, None] * (one.b - lobes[:, k, None]) / safe[:, k, None],
             )
-            for k, one in enumerate(found)
+            for k, one in zip(chosen[i], found, strict=True)
         ]
 
     return lowest_of(len(normal), reports, seen, offsets)

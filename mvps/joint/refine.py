@@ -131,11 +131,12 @@ def _agreed(surface: Surface, start: Float, state: State, capture: Capture, seen
     # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
     back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
     agreed = Agreement(back, np.full(len(back), pixel))
-    if state.vertices is None:
+    if state.vertices is None or state.under is None:
         return agreed
-    grey = grey_lights(state.lights, state.vertices.normal.device)
-    observed = Observed(capture, state.surface, state.views, state.vertices, grey, state.law)
-    return agreed.joined(photoconsistency(observed, state.lights, surface, offsets), POSITION_FLOOR_PIXELS * pixel)
+    photographs, lights = state.under
+    grey = grey_lights(lights, state.vertices.normal.device)
+    observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
+    return agreed.joined(photoconsistency(observed, lights, surface, offsets), POSITION_FLOOR_PIXELS * pixel)
 
 
 def _moved(
