@@ -201,7 +201,7 @@ def refine(
         round_settings = pending.pop(0)
         state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
         room_for(len(state.surface.vertices))
-        if creased <= MOSTLY:
+        if np.isfinite(round_settings.crease) and creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
         leaves_surface = (settings.for_field and not pending) or not round_settings.fusions
