@@ -365,8 +365,9 @@ def main(argv: Sequence[str]) -> None:
     with progress.stage("load") as stage:
         capture = read_capture(given.capture, given.views or None, given.lights or None, before_decoding)
         stage.status(f"{len(capture.views)} views, {sum(len(view.lights) for view in capture.views)} photographs")
-        # Not by an import: interrupted in one, it would leave the other thread waiting for ever.
-        libraries.join()
+        if libraries.is_alive():
+            # Not by an import: interrupted in one, it would leave the other thread waiting for ever.
+            libraries.join()
     from mvps.sound import sound
 
     capture, findings = sound(capture, progress)

@@ -106,10 +106,12 @@ def test_too_few_addresses_are_refused_before_numpy_is_there() -> None:
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Ctrl-C as at a terminal: what a shell starts in the background ignores it, and so would what the tests start."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Signals as at a terminal: what a shell starts in the background ignores Ctrl-C, under nohup a hang-up, and what tests start would."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.usefixtures("interruptible")
