@@ -22,7 +22,7 @@ with atheris.instrument_imports(include=["mvps"]):
     from fuzzing import TARGETS
 
 LONGEST = 1 << 16
-"""Bytes of a file: the largest of the targets' has a tenth."""
+"""Bytes of a file: thirteen times the largest of the targets'."""
 
 
 def main() -> None:

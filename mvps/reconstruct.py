@@ -128,13 +128,6 @@ def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySett
         return field.trained(maps, plan, lambda _, loss: stage.advance(1, loss=loss))
 
 
-def few_lights(capture: Capture) -> bool:
-    """Whether a view has fewer lights than tell normals of its own."""
-    from mvps.joint.pixels import OWN_LIGHTS
-
-    return min(len(view.lights) for view in capture.views) < OWN_LIGHTS
-
-
 def shaped(
     capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
 ) -> tuple[Surface, Refined, list[dict[str, float]]]:
@@ -144,6 +137,7 @@ def shaped(
     lights turn, as long as the residual falls. A hull that is good enough stays.
     """
     from mvps.device import chosen_device
+    from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
 
@@ -217,6 +211,7 @@ def reconstruct(
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
     from mvps.device import chosen_device
+    from mvps.joint.pixels import few_lights
     from mvps.joint.thinned import thinned
     from mvps.material import POOR_FIT
     from mvps.photometric import normal_maps

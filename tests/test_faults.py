@@ -148,7 +148,6 @@ def test_a_full_disk_while_checkpoints_are_written(capture: Path, tmp_path: Path
 
 WRITING_A_FOLDER = """
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from mvps.folders import appearing_whole
 with appearing_whole(Path(sys.argv[1])) as writing:

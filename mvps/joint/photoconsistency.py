@@ -20,15 +20,16 @@ from numpy.typing import NDArray
 from mvps.joint.agreement import Agreement, Swept, lowest_of, swept
 from mvps.joint.blocks import evaluate
 from mvps.joint.observe import channel_ratio, interior
+from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.mesh import vertex_normals
 from mvps.scene import Float, Lights, Surface, View
 
-MOST = 3
-"""Photographs of a view that take part, spread over its lights: of more, normals would tell (pixels.py)."""
+MOST = OWN_LIGHTS - 1
+"""Photographs of a view that take part, spread over its lights: more would tell a normal."""
 
 FAINTEST_LIGHT = 0.05
-"""Of a light's mean intensity: with less on a vertex (87 degrees) the albedo is noise."""
+"""Of a light's mean intensity: with less on a vertex (87 degrees) a photograph would weigh a four-hundredth of one in full light."""
 
 
 def radiance_image(view: View, light: int, ratio: Float) -> NDArray[np.float32]:

@@ -40,6 +40,11 @@ OWN_LIGHTS = 4
 """Lights of a view from which its pixels say something of their own: albedo and two angles of a normal are three unknowns."""
 
 
+def few_lights(capture: Capture) -> bool:
+    """Whether a view has fewer lights than tell normals of its own."""
+    return min(len(view.lights) for view in capture.views) < OWN_LIGHTS
+
+
 def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: Int, device: torch.device) -> ViewSamples:
     """Of some of the view's pixels, rows (n,), which show position (n, 3)."""
     image, usable = grey_radiance(view, intensity)

@@ -35,7 +35,7 @@ from mvps.joint.photometry import (
     photometric_round,
     relative_residuals,
 )
-from mvps.joint.pixels import OWN_LIGHTS
+from mvps.joint.pixels import few_lights
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.unseen import closed_over
@@ -126,7 +126,7 @@ class Refined:
 
 def _agreed(surface: Surface, start: Float, state: State, capture: Capture, seen: list[Any], offsets: Float, pixel: float) -> Agreement:
     """Where views agree that vertices of the surface lie, which were at start (V, 3) before this round moved them."""
-    if min(len(view.lights) for view in capture.views) >= OWN_LIGHTS:
+    if not few_lights(capture):
         return agreement(capture, surface, state.maps, seen, offsets)
     # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
     back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
