@@ -20,7 +20,7 @@ from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.thinned import thinned
 from mvps.load import read_capture, read_truth
 from mvps.photometric import normal_maps
-from mvps.plan import Parts, between_passes, first_pass
+from mvps.plan import Parts, carving_pass, first_pass
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, first_lights, rough_shape, shaped, stage_two
 from mvps.scene import Capture, Lights, NormalMap, Truth
@@ -49,12 +49,11 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     lights = first_lights(capture, hull, None, settings.seed, progress)
     maps = normal_maps(*thinned(capture, lights), device)
     rough = stage_two("first refinement", capture, hull, lights, maps, Parts().law(), first_pass(True, False), settings, progress)
-    surface, state, _ = shaped(capture, grid, rough, settings, between_passes(True), progress)
+    state, _ = shaped(capture, grid, rough, settings, carving_pass(True), progress)
     records = []
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))
     for k in range(rounds):
-        state = refine(capture, surface, state.lights, state.maps, state.law, one, k, device, lambda *_: None)
-        surface = state.surface
+        state = refine(capture, state.surface, state.lights, state.maps, state.law, one, k, device, lambda *_: None)
         records.append(errors(capture, truth, state.lights, state.maps))
     return records
 

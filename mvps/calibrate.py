@@ -21,6 +21,7 @@ for the rough shape's normals, one albedo for the whole object (other albedos ar
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,14 +62,21 @@ class Calibration:
     """Lights of all views, and how well the factorisation explains the images.
 
     residual: relative RMS that three factors leave; fourth_singular_value: over the first one. Both are 0.05 to 0.15 on matte and glossy
-    objects and above 0.25 where there is no diffuse body. metallic: the lights are those by correlation (correlation.py), and photometric
-    stereo by Lambert's law would say nothing.
+    objects, above 0.25 where there is no diffuse body, and NaN where there are too few lights to factorise. metallic: the lights are those
+    by correlation (correlation.py), and photometric stereo by Lambert's law would say nothing.
     """
 
     lights: Lights
     residual: float
     fourth_singular_value: float
     metallic: bool = False
+
+    def words(self) -> str:
+        """How the lights were found."""
+        kind = "one rig for all views" if self.lights.one_rig else "lights of every view on their own"
+        if math.isnan(self.residual):
+            return f"{kind}, from the rough shape's normals"
+        return f"{kind}; three factors leave {100 * self.residual:.1f} % of the images"
 
 
 @dataclass(frozen=True)

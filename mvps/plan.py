@@ -48,7 +48,7 @@ class Parts:
                 edge=one.edge * self.edges,
                 # The same curvature, seen over a longer edge.
                 crease=one.crease * self.edges,
-                fusions=one.fusions if self.moves or not plan.final else 0,
+                fusions=one.fusions if self.moves or plan.for_field else 0,
             )
             for one in plan.rounds
         )
@@ -62,9 +62,13 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True)
 
 
-def between_passes(free_lights: bool) -> RefineSettings:
-    """A round on Stage I's surface, for the normals and lights from which Stage I is trained again."""
-    return RefineSettings((RoundSettings(2.0, 1.8, 0.3),), free_lights=free_lights, for_field=True, half=True)
+COARSE = RoundSettings(2.0, 2.4, 0.3, fusions=5, carving=True)
+"""A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""
+
+
+def carving_pass(free_lights: bool) -> RefineSettings:
+    """What comes after Stage I: lights and normals on its surface, and hollows dug as deep as photographs tell."""
+    return RefineSettings((COARSE,), free_lights=free_lights, half=True)
 
 
 def last_pass(preset: str, free_lights: bool, few_lights: bool) -> RefineSettings:
@@ -80,5 +84,5 @@ def last_pass(preset: str, free_lights: bool, few_lights: bool) -> RefineSetting
         ),
     }[preset]
     if few_lights:
-        rounds = (RoundSettings(2.0, 2.4, 0.3, fusions=5, still=STILL_PIXELS), *rounds)
+        rounds = (replace(COARSE, still=STILL_PIXELS), *rounds)
     return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)

@@ -116,8 +116,7 @@ def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed:
             stage.status("given with the capture")
             return given
         calibration = uncalibrated_lights(capture, surface, seed, may_share)
-        kind = "one rig for all views" if calibration.lights.one_rig else "lights of every view on their own"
-        stage.status(f"{kind}; three factors leave {100 * calibration.residual:.1f} % of the images")
+        stage.status(calibration.words())
         return calibration.lights
 
 
@@ -130,11 +129,11 @@ def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySett
 
 def shaped(
     capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
-) -> tuple[Surface, Refined, list[dict[str, float]]]:
-    """Stage I and a round of Stage II on its surface in turn; Stage I's last surface, what Stage II last made, and its rounds.
+) -> tuple[Refined, list[dict[str, float]]]:
+    """Stage I and a coarse round of Stage II on its surface in turn; what Stage II last made, and all its rounds.
 
-    Normals carve the field's hollows, and in a better carved hollow normals and lights are better: again while the model fits badly or
-    lights turn, as long as the residual falls. A hull that is good enough stays.
+    The field digs hollows by normals, the round goes on by photographs, and in a deeper hollow normals and lights are better: the field
+    is trained again from these while the model fits badly or lights turn, as long as the residual falls. A hull that is good enough stays.
     """
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
@@ -147,21 +146,22 @@ def shaped(
     if shift < GOOD_HULL and not few_lights(capture):
         with progress.stage("occupancy field") as stage:
             stage.status(f"skipped: {words}, less than {GOOD_HULL} px")
-        return rough.surface, rough, rounds
+        return rough, rounds
     plan, refined, carried = OccupancySettings(), rough, None
     field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device))
     surface = stage_one(field, rough.maps, plan, progress, words)
-    for _ in range(MOST_TURNS):
+    for turn in range(MOST_TURNS):
+        if turn:
+            surface = stage_one(field, refined.maps, CONTINUED, progress)
         refined = stage_two(
-            "refinement between", capture, surface, refined.lights, refined.maps, refined.law, of_turn, settings, progress, carried
+            "coarse refinement", capture, surface, refined.lights, refined.maps, refined.law, of_turn, settings, progress, carried
         )
-        surface = stage_one(field, refined.maps, CONTINUED, progress)
-        residuals = [turn["residual"] for turn in rounds + refined.rounds if "residual" in turn]
+        residuals = [one["residual"] for one in rounds + refined.rounds if "residual" in one]
         rounds, carried = rounds + refined.rounds, refined.carried
         fits = residuals[-1] <= POOR_FIT and refined.rounds[-1]["light_change_deg"] <= MOVING_DEG
         if fits or residuals[-1] >= residuals[-2]:
             break
-    return surface, refined, rounds
+    return refined, rounds
 
 
 def stage_two(
@@ -215,7 +215,7 @@ def reconstruct(
     from mvps.joint.thinned import thinned
     from mvps.material import POOR_FIT
     from mvps.photometric import normal_maps
-    from mvps.plan import Parts, between_passes, first_pass, last_pass
+    from mvps.plan import Parts, carving_pass, first_pass, last_pass
 
     parts = parts or Parts()
     device = chosen_device(settings.device)
@@ -242,11 +242,11 @@ def reconstruct(
         refined = refined_by("joint refinement", parts.of(first_pass(free, True)), surface, begun)
     else:
         rough = refined_by("first refinement", parts.of(first_pass(free, False)), surface, begun)
-        turns = parts.of(between_passes(free))
-        surface, between, rounds = step("shape", lambda: shaped(used, grid, rough, settings, turns, progress))
+        turns = parts.of(carving_pass(free))
+        coarse, rounds = step("shape", lambda: shaped(used, grid, rough, settings, turns, progress))
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        plan = parts.of(last_pass(settings.preset, free and between.rounds[-1]["residual"] <= POOR_FIT, few_lights(used)))
-        refined = refined_by("joint refinement", plan, surface, between, between.carried)
+        plan = parts.of(last_pass(settings.preset, free and coarse.rounds[-1]["residual"] <= POOR_FIT, few_lights(used)))
+        refined = refined_by("joint refinement", plan, coarse.surface, coarse, coarse.carried)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
         pictures = normal_pictures(capture, used, refined)

@@ -1,4 +1,4 @@
-"""Where single photographs of a textured ball agree, a light a view."""
+"""Where single photographs of a textured ball agree."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ import torch
 import trimesh
 from sphere_scene import RADIUS, make_sphere
 
+from mvps.camera import pixel_footprint
 from mvps.joint.agreement import Agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.observe import observe
 from mvps.joint.photoconsistency import photoconsistency
 from mvps.joint.photometry import grey_lights
+from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.reflectance import Observed
+from mvps.photometric import normal_maps
 from mvps.rendering import photograph
-from mvps.scene import Capture, Lights, Material, Surface
+from mvps.scene import Capture, Law, Lights, Material, Surface
 from mvps.visibility import RayCaster
 
 CPU = torch.device("cpu")
@@ -75,6 +78,26 @@ def test_photographs_without_a_usable_value_say_nothing() -> None:
     dazzled = Capture("dazzled", tuple(replace(view, saturation=0) for view in capture.views))
     found = agreed(dazzled, lights, surface, material)
     assert np.isinf(found.sigma).all() and not found.offset.any()
+
+
+def test_a_carving_round_goes_by_photographs_where_normals_agree_that_all_is_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a hollow that is too shallow: the pixels' normals agree where the surface already is."""
+    capture, lights, surface = photographed(painted(0.8), 5)
+    pixel = pixel_footprint([view.camera for view in capture.views], np.zeros(3))
+    small = Surface(surface.vertices * (1 - pixel / RADIUS), surface.faces)
+
+    def content(_: Capture, of: Surface, *__: object) -> Agreement:
+        return Agreement(np.zeros(len(of.vertices)), np.full(len(of.vertices), 0.05 * pixel))
+
+    monkeypatch.setattr("mvps.joint.refine.agreement", content)
+
+    def off(carving: bool) -> float:
+        plan = RefineSettings((RoundSettings(2.0, 2.4, 0.3, carving=carving),), free_lights=False)
+        maps = normal_maps(capture, lights, CPU)
+        refined = refine(capture, small, lights, maps, Law((20.0,)), plan, 0, CPU, lambda *_: None)
+        return float(np.abs(np.linalg.norm(refined.surface.vertices, axis=1) - RADIUS).mean() / pixel)
+
+    assert off(carving=True) < 0.1 and off(carving=False) > 0.5
 
 
 def test_together_the_surer_decides_and_what_is_unknown_does_not() -> None:

@@ -150,11 +150,12 @@ def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> 
         rounds=[{"residual": 0.01, "light_change_deg": 0.0, "vertex_change_px": 0.0}],
     )
     monkeypatch.setattr("mvps.reconstruct.stage_one", lambda *_: "field")
-    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: rough)
+    refined = SimpleNamespace(**vars(rough) | {"surface": "refined"})
+    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    for lights, surface in ((1, "field"), (3, "field"), (4, "hull")):
+    for lights, surface in ((1, "refined"), (3, "refined"), (4, "hull")):
         capture = SimpleNamespace(views=[SimpleNamespace(lights=tuple(range(lights)))])
-        assert shaped(capture, None, rough, Settings("somewhere"), True, Progress())[0] == surface  # type: ignore[arg-type]
+        assert shaped(capture, None, rough, Settings("somewhere"), True, Progress())[0].surface == surface  # type: ignore[arg-type]
 
 
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
@@ -221,6 +222,6 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
     monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined(*next(made)))
     monkeypatch.setattr("mvps.reconstruct.stage_one", one)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    _, last, rounds = shaped(None, None, refined(0.3, 5.0), Settings("somewhere"), True, None)  # type: ignore[arg-type]
-    assert trained == [OccupancySettings().steps] + turns * [CONTINUED.steps]
+    last, rounds = shaped(None, None, refined(0.3, 5.0), Settings("somewhere"), True, None)  # type: ignore[arg-type]
+    assert trained == [OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
     assert [r["residual"] for r in rounds] == [0.3, *residuals[:turns]] and last.rounds[0]["residual"] == residuals[turns - 1]

@@ -1,4 +1,4 @@
-"""Where photographs agree: offsets of vertices along their normals, for views of too few lights for normals of their own.
+"""Where photographs agree: offsets of vertices along their normals, where the views' own normals do not tell.
 
 As agreement.py, but what a view reports of a vertex x that slides along its normal is the albedo that single photographs show there:
 
@@ -7,7 +7,8 @@ As agreement.py, but what a view reports of a vertex x that slides along its nor
 J is radiance over the light's colour, P what the vertex's lobes reflect and q = dI/da the light on it (blocks.py): both are of the vertex
 as it is, and do not slide. Weights are the squared cosine of the viewing angle times q^2, the inverse variance of b under image noise.
 On the surface all photographs show one albedo; beside it they show texture and shading of other places (photo-consistency: Seitz and Dyer
-1999).
+1999). Normals are none where a view has too few lights, and in a hollow that is too shallow they agree where the surface already is, as
+they were solved there.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mvps.mesh import vertex_normals
 from mvps.scene import Float, Lights, Surface, View
 
 MOST = OWN_LIGHTS - 1
-"""Photographs of a view that take part, spread over its lights: more would tell a normal."""
+"""Photographs of a view that take part, spread over its lights: as many as a view may have without telling a normal."""
 
 FAINTEST_LIGHT = 0.05
 """Of a light's mean intensity: with less on a vertex (87 degrees) a photograph would weigh a four-hundredth of one in full light."""

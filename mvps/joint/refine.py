@@ -74,7 +74,8 @@ class RoundSettings:
     lights and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge
     before it is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY); fusions: faces turn and move, so
     that other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows; without any the surface
-    stays."""
+    stays. still: pixels that vertices may move in the mean before the round is done again. carving: single photographs say where vertices
+    lie, not the pixels' normals, which in a hollow that is too shallow agree where the surface already is."""
 
     edge: float
     reach: float
@@ -84,6 +85,7 @@ class RoundSettings:
     for_detail: bool = False
     fusions: int = 3
     still: float = np.inf
+    carving: bool = False
 
     def offsets(self) -> Float:
         """Offsets of the sweep, pixels."""
@@ -124,11 +126,14 @@ class Refined:
     carried: tuple[Surface, Vertices] | None = None
 
 
-def _agreed(surface: Surface, start: Float, state: State, capture: Capture, seen: list[Any], offsets: Float, pixel: float) -> Agreement:
+def _agreed(
+    surface: Surface, start: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
+) -> Agreement:
     """Where views agree that vertices of the surface lie, which were at start (V, 3) before this round moved them."""
-    if not few_lights(capture):
+    offsets = settings.offsets() * pixel
+    # Normals of views of few lights are the mesh's own (pixels.py) and agree wherever it is.
+    if not (settings.carving or few_lights(capture)):
         return agreement(capture, surface, state.maps, seen, offsets)
-    # Normals of such views are the mesh's own (pixels.py) and agree wherever it is.
     back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
     agreed = Agreement(back, np.full(len(back), pixel))
     if state.vertices is None or state.under is None:
@@ -148,7 +153,7 @@ def _moved(
     distance = mask_distances(capture)
     factor, start = None, surface.vertices
     for _ in range(settings.fusions):
-        agreed = _agreed(surface, start, state, capture, seen, settings.offsets() * pixel, pixel)
+        agreed = _agreed(surface, start, state, capture, seen, settings, pixel)
         agreed = with_masks(agreed, capture, surface, distance, floor)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
