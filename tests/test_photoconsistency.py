@@ -14,7 +14,7 @@ from mvps.camera import pixel_footprint
 from mvps.joint.agreement import Agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.observe import observe
-from mvps.joint.photoconsistency import photoconsistency
+from mvps.joint.photoconsistency import photoconsistency, shown_in
 from mvps.joint.photometry import grey_lights
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.reflectance import Observed
@@ -59,7 +59,7 @@ def agreed(capture: Capture, lights: Lights, surface: Surface, material: Materia
     normal, values = (torch.tensor(a, dtype=torch.float32) for a in (material.normal, reflectance))
     vertices = Vertices(normal, values, 0.1 * values[:, 0])
     of = Observed(capture, small, observe(capture, small, lights, CPU), vertices, grey_lights(lights, CPU), material.law)
-    return photoconsistency(of, lights, small, OFFSETS)
+    return photoconsistency(shown_in(of, lights), small, OFFSETS)
 
 
 @pytest.mark.parametrize("texture", [0.0, 0.8])

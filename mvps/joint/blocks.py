@@ -80,7 +80,7 @@ class DirectionalLights:
     direction: Tensor
     intensity: Tensor
 
-    def of(self, rows: slice) -> DirectionalLights:
+    def of(self, rows: slice | Tensor) -> DirectionalLights:
         """Only some of them."""
         return DirectionalLights(self.direction[rows], self.intensity[rows])
 

@@ -64,7 +64,7 @@ class ViewSamples:
         gathered = None if self.gathered is None else self.gathered[rows]
         return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered)
 
-    def of_lights(self, rows: slice) -> ViewSamples:
+    def of_lights(self, rows: slice | Tensor) -> ViewSamples:
         """Only some of the lights."""
         image, data, gathered = (None if a is None else a[:, rows].contiguous() for a in (self.image, self.data, self.gathered))
         assert image is not None and data is not None

@@ -79,4 +79,4 @@ def refine_view(
         account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, "vertex_change_px": 0.0})
         on_round(number, account[-1])
     assert state is not None
-    return finished(state, settings, account, device, generator)
+    return finished(state, settings, account, generator)

@@ -13,18 +13,21 @@ they were solved there.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from mvps.cores import on_cores
 from mvps.joint.agreement import Agreement, Swept, lowest_of, swept
-from mvps.joint.blocks import evaluate
-from mvps.joint.observe import channel_ratio, interior
+from mvps.joint.blocks import DirectionalLights, evaluate
+from mvps.joint.observe import ViewSamples, channel_ratio, interior
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.mesh import vertex_normals
-from mvps.scene import Float, Lights, Surface, View
+from mvps.scene import Float, Int, Lights, Surface, View
 
 MOST = OWN_LIGHTS - 1
 """Photographs of a view that take part, spread over its lights: as many as a view may have without telling a normal."""
@@ -42,34 +45,55 @@ def radiance_image(view: View, light: int, ratio: Float) -> NDArray[np.float32]:
     return image
 
 
-def photoconsistency(of: Observed, lights: Lights, surface: Surface, offsets: Float) -> Agreement:
-    """Where along its normal each vertex shows one albedo. lights: of the photographs of `of`; surface: that of `of`, perhaps moved since;
-    offsets (n,) evenly spaced, world units."""
-    normal, seen = vertex_normals(surface), [samples.vertex.cpu().numpy() for samples in of.views]
-    chosen = [np.unique(np.arange(MOST) * len(view.lights) // MOST) for view in of.capture.views]
-    images = [
-        [radiance_image(view, k, channel_ratio(intensity)[k]) for k in some]
-        for view, intensity, some in zip(of.capture.views, lights.intensity, chosen, strict=True)
-    ]
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What m photographs of a view show of the n vertices that it sees, in order of their numbers: (n, m) the vertices' lobes P, the light
+    q on them (1 where a photograph is no data) and its weight q^2 over the light's, 0 where there is none."""
+
+    view: View
+    vertex: Int
+    images: list[NDArray[np.float32]]
+    lobes: NDArray[np.float32]
+    light: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+
+def shown_in(of: Observed, lights: Lights) -> list[Shown]:
+    """Of every view a few photographs, as shown of the vertices as they are; lights: of all photographs of `of`."""
+
+    def in_view(view: View, samples: ViewSamples, grey: DirectionalLights, intensity: Float) -> Shown:
+        some = np.unique(np.arange(MOST) * len(view.lights) // MOST)
+        rows = torch.as_tensor(some, device=samples.vertex.device)
+        few, grey = samples.of_lights(rows), grey.of(rows)
+        reflectance = of.vertices.reflectance[few.vertex]
+        shaded = evaluate(of.vertices.normal[few.vertex], reflectance, few.towards, grey, of.law, few.gathered)
+        q, level = (a.cpu().numpy() for a in (shaded.basis[0], grey.intensity))
+        lit = (q > FAINTEST_LIGHT * level) & few.data.cpu().numpy()
+        lobes = (shaded.predicted - reflectance[:, :1] * shaded.basis[0]).cpu().numpy()
+        ratio = channel_ratio(intensity)
+        images = [radiance_image(view, k, ratio[k]) for k in some]
+        return Shown(view, few.vertex.cpu().numpy(), images, lobes, np.where(lit, q, 1), np.where(lit, (q / level) ** 2, 0))
+
+    return on_cores(in_view, of.capture.views, of.views, of.lights, lights.intensity)
+
+
+def photoconsistency(photographs: Sequence[Shown], surface: Surface, offsets: Float) -> Agreement:
+    """Where along its normal each vertex of the surface, which may have moved since, shows one albedo; offsets (n,) evenly spaced, world
+    units."""
+    normal = vertex_normals(surface)
 
     def reports(i: int, some: slice) -> list[Swept]:
-        samples, vertex = of.views[i], seen[i][some]
-        index = samples.vertex[some]
-        reflectance = of.vertices.reflectance[index]
-        shaded = evaluate(of.vertices.normal[index], reflectance, samples.towards[some], of.lights[i], of.law, samples.gathered_of(some))
-        lobes = (shaded.predicted - reflectance[:, :1] * shaded.basis[0]).cpu().numpy()
-        q, level = (a.cpu().numpy() for a in (shaded.basis[0], of.lights[i].intensity))
-        lit = (q > FAINTEST_LIGHT * level) & samples.data[some].cpu().numpy()
-        weight, safe = np.where(lit, (q / level) ** 2, 0), np.where(lit, q, 1)
-        found = swept(of.capture.views[i], images[i], surface.vertices[vertex], normal[vertex], offsets, vertex)
+        of, vertex = photographs[i], photographs[i].vertex[some]
+        lobes, light, weight = (a[some] for a in (of.lobes, of.light, of.weight))
+        found = swept(of.view, of.images, surface.vertices[vertex], normal[vertex], offsets, vertex)
         return [
             replace(
                 one,
                 facing=one.facing * weight[:, k],
                 weight=one.weight * weight[:, k, None],
-                b=lit[:, k, None] * (one.b - lobes[:, k, None]) / safe[:, k, None],
+                b=np.where(weight[:, k, None] > 0, (one.b - lobes[:, k, None]) / light[:, k, None], 0),
             )
-            for k, one in zip(chosen[i], found, strict=True)
+            for k, one in enumerate(found)
         ]
 
-    return lowest_of(len(normal), reports, seen, offsets)
+    return lowest_of(len(normal), reports, [of.vertex for of in photographs], offsets)

@@ -22,7 +22,7 @@ from mvps.joint.colours import colours, lobes_in_colour
 from mvps.joint.fused import face_targets
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
-from mvps.joint.photoconsistency import photoconsistency
+from mvps.joint.photoconsistency import photoconsistency, shown_in
 from mvps.joint.photometry import (
     TRIAL_VERTICES,
     WEAK_TIE,
@@ -126,22 +126,28 @@ class Refined:
     carried: tuple[Surface, Vertices] | None = None
 
 
-def _agreed(
-    surface: Surface, start: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
-) -> Agreement:
-    """Where views agree that vertices of the surface lie, which were at start (V, 3) before this round moved them."""
-    offsets = settings.offsets() * pixel
-    # Normals of views of few lights are the mesh's own (pixels.py) and agree wherever it is.
-    if not (settings.carving or few_lights(capture)):
-        return agreement(capture, surface, state.maps, seen, offsets)
-    back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
-    agreed = Agreement(back, np.full(len(back), pixel))
-    if state.vertices is None or state.under is None:
-        return agreed
+def _observed(state: State) -> tuple[Observed, Lights]:
+    """What the round observed, in grey, and its photographs' lights."""
+    assert state.vertices is not None and state.under is not None
     photographs, lights = state.under
     grey = grey_lights(lights, state.vertices.normal.device)
-    observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
-    return agreed.joined(photoconsistency(observed, lights, surface, offsets), POSITION_FLOOR_PIXELS * pixel)
+    return Observed(photographs, state.surface, state.views, state.vertices, grey, state.law), lights
+
+
+def _agreement_of(state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float) -> Callable[[Surface], Agreement]:
+    """Where views agree that vertices lie, of the round's surface wherever it has moved since."""
+    offsets, start, normals = settings.offsets() * pixel, state.surface.vertices, state.maps
+    # Normals of views of few lights are the mesh's own (pixels.py) and agree wherever it is.
+    if not (settings.carving or few_lights(capture)):
+        return lambda surface: agreement(capture, surface, normals, seen, offsets)
+    photographs = [] if state.vertices is None else shown_in(*_observed(state))
+
+    def agreed(surface: Surface) -> Agreement:
+        back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
+        held = Agreement(back, np.full(len(back), pixel))
+        return held.joined(photoconsistency(photographs, surface, offsets), POSITION_FLOOR_PIXELS * pixel) if photographs else held
+
+    return agreed
 
 
 def _moved(
@@ -151,10 +157,9 @@ def _moved(
     normals where no view sees."""
     floor = POSITION_FLOOR_PIXELS * pixel
     distance = mask_distances(capture)
-    factor, start = None, surface.vertices
+    factor, agreement_of = None, _agreement_of(state, capture, seen, settings, pixel)
     for _ in range(settings.fusions):
-        agreed = _agreed(surface, start, state, capture, seen, settings, pixel)
-        agreed = with_masks(agreed, capture, surface, distance, floor)
+        agreed = with_masks(agreement_of(surface), capture, surface, distance, floor)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
     known = np.zeros(len(surface.vertices), bool)
@@ -234,16 +239,14 @@ def refine(
         before = None if far and again else round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
-    return replace(finished(state, settings, account, device, generator), carried=carried)
+    return replace(finished(state, settings, account, generator), carried=carried)
 
 
-def _coloured(state: State, neural: bool, device: torch.device, generator: np.random.Generator) -> Material:
+def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Material:
     """The material with albedo and lobes in the photographs' colours, a neural residual, if allowed, where that helps, and the stated
     error."""
-    assert state.vertices is not None and state.under is not None
-    photographs, lights = state.under
-    ratios, grey = [channel_ratio(e) for e in lights.intensity], grey_lights(lights, device)
-    observed = Observed(photographs, state.surface, state.views, state.vertices, grey, state.law)
+    observed, lights = _observed(state)
+    ratios = [channel_ratio(e) for e in lights.intensity]
     coloured_lobes = False
     if state.law.sharpness:
         state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
@@ -251,21 +254,17 @@ def _coloured(state: State, neural: bool, device: torch.device, generator: np.ra
     albedo, tint = colours(observed, ratios, coloured_lobes)
     residual = None
     if neural:
-        trial, residual = neural_residual(observed, relative_residuals(state.views, state.vertices), POOR_FIT, generator)
+        trial, residual = neural_residual(observed, relative_residuals(observed.views, observed.vertices), POOR_FIT, generator)
         state.trials.append(trial)
     certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE), 0)
     material = replace(material_of(state, albedo), confidence=certain, residual=residual)
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 
 
-def finished(
-    state: State, settings: RefineSettings, account: list[dict[str, float]], device: torch.device, generator: np.random.Generator
-) -> Refined:
+def finished(state: State, settings: RefineSettings, account: list[dict[str, float]], generator: np.random.Generator) -> Refined:
     """What the rounds came to; in colour if that is final."""
     assert state.vertices is not None
-    material = (
-        _coloured(state, settings.model.neural, device, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
-    )
+    material = _coloured(state, settings.model.neural, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
     status, text = _settled(account)
     return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
 
