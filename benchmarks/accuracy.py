@@ -159,6 +159,14 @@ def table(rows: list[dict[str, Any]], columns: Sequence[tuple[str, str, float, i
     return "\n".join(lines)
 
 
+def machines(rows: list[dict[str, Any]]) -> str:
+    """Where rows were made, in words: all on one machine, or which on which."""
+    cases: dict[str, list[str]] = {}
+    for row in rows:
+        cases.setdefault(row["machine"], []).append(row["case"])
+    return "; ".join(f"{name} ({', '.join(some)})" if len(cases) > 1 else name for name, some in cases.items())
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -169,18 +177,18 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=1, help="runs of each case; the table says how many, and has their median time")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = [measure(name, given.captures, given.preset, given.device, Path(folder), given.repeats) for name in given.cases or CASES]
+        made = [measure(name, given.captures, given.preset, given.device, Path(folder), given.repeats) for name in given.cases or CASES]
+    rows = [row | {"machine": machine(given.device)} for row in made]
     suffix, option = ("", "") if given.device == "cpu" else (f"-{given.device}", f" --device {given.device}")
     stem = HERE / f"accuracy-{given.preset}{suffix}"
     if stem.with_suffix(".json").exists():
         before = {row["case"]: row for row in json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"]}
         found = before | {row["case"]: row for row in rows}
         rows = [found[name] for name in CASES if name in found]
-    found_on = machine(given.device)
-    record = {"machine": found_on, "preset": given.preset, "rows": rows}
+    record = {"preset": given.preset, "rows": rows}
     stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset}{option}"
-    text = f"`{command}` on {found_on}; s is the median of the runs.\n\n{table(rows)}\n"
+    text = f"`{command}` on {machines(rows)}; s is the median of the runs.\n\n{table(rows)}\n"
     stem.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 
