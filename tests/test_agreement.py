@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
-from mvps.joint.agreement import VERTICES_AT_ONCE, Agreement, agreement
+from mvps.joint.agreement import VERTICES_AT_ONCE, Agreement, Swept, agreement, lowest_of
 from mvps.joint.observe import visible_in
 from mvps.mesh import isotropic_remesh
 from mvps.rendering import points_under
@@ -60,3 +60,22 @@ def test_a_view_that_shows_something_else_is_an_outlier(scene: SphereScene, monk
     plain = agreed_from(scene, tuple(maps))
     moved = [np.abs(found.offset - clean.offset)[np.isfinite(found.sigma)].mean() for found in (robust, plain)]
     assert moved[0] < 0.6 * moved[1]
+
+
+def test_reports_that_no_float32_holds_say_nothing_of_their_vertex_alone() -> None:
+    """One NaN would spread over the whole surface in the fusion's solve."""
+    offsets, rng = np.linspace(-1, 1, 9), np.random.default_rng(0)
+    apart = (offsets - 0.3)[None, :] ** 2 * np.ones((5, 1))
+
+    def report(i: int, some: slice) -> list[Swept]:
+        b = (rng.normal(size=(3, 5, 1)) * apart).astype(np.float32)
+        b[:, 2] = 1e25 * (-1) ** i
+        weight = np.ones((5, 9), np.float32)
+        weight[2, :4] = 0 if i else 1
+        return [Swept(np.arange(5)[some], np.ones(5, np.float32), weight, b)]
+
+    with np.errstate(all="ignore"):
+        found = lowest_of(5, report, [np.arange(5)] * 4, offsets)
+        both = found.joined(found, 0.01)
+    assert np.isinf(found.sigma[2]) and np.isfinite(found.offset).all() and np.isfinite(both.offset).all()
+    assert np.abs(np.delete(found.offset, 2) - 0.3).max() < 0.1

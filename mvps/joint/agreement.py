@@ -191,6 +191,8 @@ def _lowest(cost: Float, known: NDArray[np.bool_], views: Float, offsets: Float)
     """Of cost (V, offsets), known (V,), views (V,)."""
     step = float(offsets[1] - offsets[0])
     best = cost.argmin(1)
+    # Costs that no float32 holds say nothing; as a number, one of them would spread over the whole surface.
+    known = known & np.isfinite(cost).all(1)
     inside = (best > 0) & (best < len(offsets) - 1) & known
     middle = np.clip(best, 1, len(offsets) - 2)
     rows = np.arange(len(cost))
