@@ -31,8 +31,8 @@ VERTEX = 6500.0
 IN_WORK = 25.0
 """Grey value, usable, shadow, gathered light, and copies of those that hit."""
 
-DENSITY = {"draft": 0.35, "standard": 1.25, "fine": 2.8}
-"""Vertices over the area in pixels. In `standard` 0.8 to 1.2 on two captures, and 3.5 on one that is creased all over."""
+DENSITY = {"draft": 0.35, "standard": 0.8, "fine": 2.8}
+"""Vertices over the area in pixels. In `standard` 0.67 and 0.73 on two captures, 2.3 and 2.7 on two that are creased all over."""
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8
 """Numbers of glibc's options (malloc.h)."""

@@ -62,7 +62,7 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True)
 
 
-COARSE = RoundSettings(2.0, 2.4, 0.3, fusions=5, carving=True)
+COARSE = RoundSettings(2.0, 2.4, 0.4, carving=True)
 """A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""
 
 
@@ -74,13 +74,13 @@ def carving_pass(free_lights: bool) -> RefineSettings:
 def last_pass(preset: str, free_lights: bool, few_lights: bool) -> RefineSettings:
     """Rounds after Stage I; sweeps reach as far as Stage I may be off. few_lights: fewer of a view than tell a normal. Then Stage I had
     nothing but vertices' normals to go by, and photographs have farther to pull the surface."""
-    first = RoundSettings(1.5, 1.2, 0.3, crease=0.1, fusions=5)
+    first = RoundSettings(2.0, 1.2, 0.3, crease=0.1)
     rounds = {
         "standard": (first, replace(first, for_detail=True)),
         "fine": (
-            RoundSettings(1.0, 1.2, 0.3, fusions=5),
-            RoundSettings(0.8, 1.2, 0.3, crease=0.2, fusions=5),
-            RoundSettings(0.8, 0.6, 0.2, crease=0.1, fusions=5),
+            RoundSettings(1.5, 1.2, 0.3),
+            RoundSettings(0.8, 1.2, 0.3, crease=0.2),
+            RoundSettings(0.8, 0.6, 0.2, crease=0.1),
         ),
     }[preset]
     if few_lights:

@@ -48,8 +48,9 @@ def test_lights_that_stay_are_those_of_the_factorisation(capture: Capture) -> No
 def test_parts_change_nothing_else() -> None:
     for plan in (first_pass(True, False), first_pass(False, True), last_pass("standard", True, False), last_pass("fine", False, True)):
         assert Parts().of(plan) == plan
-    coarse = Parts(edges=2.0).of(last_pass("standard", True, False))
-    assert [one.edge for one in coarse.rounds] == [3.0, 3.0] and coarse.model == LARGEST
+    plan = last_pass("standard", True, False)
+    coarse = Parts(edges=2.0).of(plan)
+    assert [one.edge for one in coarse.rounds] == [2 * one.edge for one in plan.rounds] and coarse.model == LARGEST
 
 
 def test_budgets_are_methods() -> None:
