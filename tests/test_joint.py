@@ -218,6 +218,16 @@ def test_fusing_true_normals_and_positions_mends_a_dented_sphere() -> None:
     assert error.mean() < 0.3 * np.abs(dents).mean()
 
 
+def test_what_is_no_number_moves_nothing_and_the_rest_moves() -> None:
+    ball = make_sphere(3).reconstruction.surface
+    target = normalise(normalise(ball.vertices)[ball.faces].sum(1))
+    target[7] = np.nan
+    agreed = Agreement(np.ones(len(ball.vertices)), np.full(len(ball.vertices), 0.1))
+    agreed.offset[3] = agreed.sigma[50] = np.nan
+    grown = np.linalg.norm(fuse(ball, target, agreed, 0.02)[0].vertices, axis=1)
+    assert np.abs(grown - RADIUS - 1).mean() < 0.1
+
+
 def test_pixels_of_a_fold_show_more_than_one_normal() -> None:
     """In any unit: a sphere of 20 pixels radius bends by a twentieth of a radian in a pixel. What is within half a pixel is not seen."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=20.0)

@@ -60,7 +60,7 @@ def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: 
         slope = (beyond - before) / 2
         told = slope > ALONG
         weight = told * line.length * SHARED * (line.rate / MASK_SIGMA_PIXELS) ** 2
-        wanted = -here / np.where(told, slope, 1) / line.rate
+        wanted = -here / np.where(told, slope, 1) / np.where(line.rate > 0, line.rate, 1)
         corners, shares = surface.faces[line.face].ravel(), weight[:, None] * line.barycentric
         weights, pulls = (np.bincount(corners, values.ravel(), count) for values in (shares, shares * wanted[:, None]))
         return weights.astype(np.float64), pulls.astype(np.float64)
@@ -101,11 +101,13 @@ def fuse(
     x = surface.vertices
     scale = len(x) / (normal_sigma**2 * face_areas(surface).sum())
     L = igl.cotmatrix(x, surface.faces) * -scale
+    # Solved together, one that is no number would take all others with it.
+    target = np.where(np.isfinite(target).all(1, keepdims=True), target, face_normals(surface))
+    known = np.isfinite(agreed.offset) & np.isfinite(agreed.sigma)
+    offset, sigma = np.where(known, agreed.offset, 0), np.where(known, agreed.sigma, np.inf)
     right = _turned_divergence(surface, target) * scale
     outward = vertex_normals(surface)
-    agreed_at = x + agreed.offset[:, None] * outward
-    sigma = agreed.sigma
-    weight = np.where(np.isfinite(sigma), 1 / sigma**2, 0)
+    agreed_at, weight = x + offset[:, None] * outward, 1 / sigma**2
     # Vertices that no views agree on hold still softly: without them a patch seen by nobody would have no place.
     rest = 1e-4 * float(np.median(weight[weight > 0])) if (weight > 0).any() else 1.0
     y = x
