@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.cores import at_a_time
+from mvps.cores import neighbours
 from mvps.mesh import face_normals, mean_edge_length, vertex_normals
 from mvps.scene import Float, Int, Surface
 from mvps.visibility import RayCaster, cast_shadow, ray_caster
@@ -138,7 +138,7 @@ def at(sources: Sources, G: NDArray[np.float32], points: Float, normal: Float) -
 
 def interpolation(of: Gather, points: Float, normal: Float) -> sp.csr_matrix:
     """(points, n) weights of the patches at points with normals (points, 3): inverse squared distance, facing the same way."""
-    distance, index = of.tree.query(points, k=NEIGHBOURS, workers=at_a_time())
+    distance, index = neighbours(of.tree, points, NEIGHBOURS)
     near = 1e-3 * float(np.median(distance)) + 1e-300
     weight = np.maximum((normal[:, None] * of.normal[index]).sum(-1), 0.05) / np.maximum(distance, near) ** 2
     weight /= weight.sum(1, keepdims=True)

@@ -68,25 +68,33 @@ def parse(made: Parser, argv: Sequence[str]) -> argparse.Namespace:
 
 
 class _Ended(KeyboardInterrupt):
-    """By a signal whose number is its first argument, and like Ctrl-C: nothing half-written stays."""
+    """By a signal whose number is its first argument: nothing half-written stays."""
 
 
 @contextmanager
 def _signals() -> Iterator[None]:
     """While a command runs, a request to end is an exception. Where a caller has his own way with a signal, that stays."""
     mine = threading.current_thread() is threading.main_thread()
-    asked = [number for number in (signal.SIGTERM, signal.SIGHUP) if mine and signal.getsignal(number) is signal.SIG_DFL]
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    asked = [number for number, way in before.items() if mine and way in (signal.SIG_DFL, signal.default_int_handler)]
+    came: list[int] = []
 
     def end(number: int, _: object) -> NoReturn:
+        came.append(number)
         raise _Ended(number)
 
     for number in asked:
         signal.signal(number, end)
     try:
         yield
+    except Exception as error:
+        if came:
+            # On its way out a library has made another exception of it (some take whatever ends an import for a missing file).
+            raise _Ended(came[0]) from error
+        raise
     finally:
         for number in asked:
-            signal.signal(number, signal.SIG_DFL)
+            signal.signal(number, before[number])
 
 
 def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:

@@ -10,7 +10,13 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Result = TypeVar("Result")
 
@@ -44,3 +50,11 @@ def one_by_one(task: Callable[[int], Result], total: int) -> Iterator[Result]:
             waiting.append(pool.submit(task, number))
         while waiting:
             yield waiting.popleft().result()
+
+
+def neighbours(tree: cKDTree, points: NDArray[Any], k: int = 1, p: float = 2) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Distance and index (n,), or (n, k), of the tree's points nearest to points (n, 3), in the p-norm, on all cores. (The tree's own
+    threads are abandoned by an interruption, and abort the process when it ends.)"""
+    parts = on_cores(lambda some: tree.query(some, k=k, p=p), np.array_split(points, at_a_time()))
+    distance, index = (np.concatenate(values) for values in zip(*parts, strict=True))
+    return distance, index

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -305,10 +306,8 @@ def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
 
 def load_libraries() -> None:
     """What the stages are made of: 2 s on one core, while photographs are decoded outside the interpreter's lock."""
-    import mvps.joint.refine
-    import mvps.report
-    import mvps.sound
-    import mvps.texture  # noqa: F401
+    for name in ("mvps.joint.refine", "mvps.report", "mvps.sound", "mvps.texture", "gpytoolbox", "gpytoolbox_bindings"):
+        import_module(name)
 
 
 FACES_HELP = "write models of about so many faces too (model_N.glb, model_N.obj), their detail in the normal map"

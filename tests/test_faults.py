@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +119,22 @@ def test_an_interruption_while_loading_leaves_no_trace() -> None:
     with loading():
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interruption_that_a_library_makes_an_exception_of_its_own_is_one_still(
+    number: signal.Signals, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(_: Sequence[str]) -> None:
+        try:
+            signal.raise_signal(number)
+        except BaseException:
+            raise ImportError("no such library")  # noqa: B904
+
+    before = signal.getsignal(number)
+    assert run(work, []) == 128 + number and signal.getsignal(number) is before
+    assert capsys.readouterr().err == "mvps: interrupted before the end\n"
 
 
 def with_small_files(most: int, *arguments: object) -> subprocess.CompletedProcess[str]:

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
 from mvps.camera import pixel_footprint
-from mvps.cores import at_a_time
+from mvps.cores import neighbours
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
@@ -99,7 +99,7 @@ def _started(
 ) -> Vertices:
     """Vertices of the new mesh: from the nearest vertex of the last round's, or from the views' photometric stereo."""
     if carried is not None:
-        nearest = torch.from_numpy(cKDTree(carried[0].vertices).query(state.surface.vertices, workers=at_a_time())[1]).to(device)
+        nearest = torch.from_numpy(neighbours(cKDTree(carried[0].vertices), state.surface.vertices)[1]).to(device)
         old = carried[1]
         return Vertices(old.normal[nearest], old.reflectance[nearest], old.scale[nearest])
     seen = [(s.vertex.cpu().numpy(), s.weight.cpu().numpy()) for s in state.views]
@@ -310,9 +310,7 @@ def material_of(state: State, albedo: Float) -> Material:
     assert state.vertices is not None
     vertices, known = state.vertices, np.isfinite(albedo).all(1)
     nearest = np.arange(len(albedo))
-    nearest[~known] = np.flatnonzero(known)[
-        cKDTree(state.surface.vertices[known]).query(state.surface.vertices[~known], workers=at_a_time())[1]
-    ]
+    nearest[~known] = np.flatnonzero(known)[neighbours(cKDTree(state.surface.vertices[known]), state.surface.vertices[~known])[1]]
     normal = normalise(vertices.normal.double().cpu().numpy())
     normal[~known] = vertex_normals(state.surface)[~known]
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mvps.cores import at_a_time
+from mvps.cores import neighbours
 from mvps.mesh import edges, lengths, split_edges
 from mvps.scene import Float, Int, Surface
 
@@ -23,7 +23,7 @@ ICP_ROUNDS, ICP_TOLERANCE = 100, 1e-6
 
 def nearest(points: Float, others: Float, norm: int = 2) -> tuple[Float, Int]:
     """Distance (n,) of points (n, 3) to the nearest of others (m, 3), and its index (n,); norm 1 or 2."""
-    distance, index = cKDTree(others).query(points, p=norm, workers=at_a_time())
+    distance, index = neighbours(cKDTree(others), points, p=norm)
     return distance, index
 
 
@@ -51,7 +51,7 @@ def icp(points: Float, target: Float) -> tuple[Float, Float]:
     """Rotation (3, 3) and shift (3,) that bring points (n, 3), rotation @ point + shift, onto target (m, 3), from where they are."""
     rotation, shift, before, tree = np.eye(3), np.zeros(3), np.inf, cKDTree(target)
     for _ in range(ICP_ROUNDS):
-        distance, index = tree.query(points @ rotation.T + shift, workers=at_a_time())
+        distance, index = neighbours(tree, points @ rotation.T + shift)
         error = float(np.sqrt((distance**2).mean()))
         if error >= (1 - ICP_TOLERANCE) * before:
             break
