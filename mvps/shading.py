@@ -39,9 +39,14 @@ PARALLEL = 1e-6
 """Floor of 2 + 2 v.l: view and light exactly opposite have no half vector (and such a point is never lit and seen)."""
 
 
+def half_length(v_dot_l: Tensor) -> Tensor:
+    """|v + l| for v . l."""
+    return (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
+
+
 def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor:
     """h . n for n . v (points, 1), n . l (points, lights) and v . l (points, lights)."""
-    return (n_dot_v + n_dot_l) / (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
+    return (n_dot_v + n_dot_l) / half_length(v_dot_l)
 
 
 def lobe(h_dot_n: Tensor, sharpness: float, microfacet: bool) -> tuple[Tensor, Tensor | float]:

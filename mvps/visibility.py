@@ -13,6 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
 
 from mvps.camera import pixel_centres, project, rays, view_directions
 from mvps.cores import on_cores
@@ -38,7 +39,7 @@ class RayCaster:
         self._centre = (vertices.min(0) + vertices.max(0)) / 2
         self._scale = float(np.abs(vertices - self._centre).max()) or 1.0
         self._scene = EmbreeScene(robust=True)
-        self._mesh = TriangleMesh(self._scene, self._local(vertices), surface.faces.astype(np.int32))
+        self._mesh = TriangleMesh(self._scene, self.local(vertices), surface.faces.astype(np.int32))
         # The first query builds the tree; later queries may then come from several threads.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
         self.surface = surface
@@ -53,13 +54,14 @@ class RayCaster:
         """Length below which the mesh has no detail: the mean of its edges. Rays that leave the mesh start this far away."""
         return mean_edge_length(self.surface)
 
-    def _local(self, points: Float) -> Any:
+    def local(self, points: Float) -> NDArray[np.float32]:
+        """(n, 3) points in the frame that Embree sees."""
         return np.ascontiguousarray((points - self._centre) / self._scale, dtype=np.float32)
 
     def first_hits(self, origins: Float, directions: Float) -> Hits:
         """First hits of rays from origins (n, 3) along unit directions (n, 3)."""
         chunks = _in_chunks(
-            lambda s: self._scene.run(self._local(origins[s]), directions[s].astype(np.float32), query="INTERSECT", output=1),
+            lambda s: self._scene.run(self.local(origins[s]), directions[s].astype(np.float32), query="INTERSECT", output=1),
             len(origins),
         )
         joined = {k: np.concatenate([c[k] for c in chunks]) if chunks else np.zeros(0) for k in ("primID", "u", "v", "tfar")}
@@ -72,11 +74,13 @@ class RayCaster:
 
     def occluded(self, origins: Float, directions: Float) -> Bool:
         """(n,) True where a ray from origins (n, 3) along unit directions (n, 3) meets the mesh."""
-        chunks = _in_chunks(
-            lambda s: self._scene.run(self._local(origins[s]), directions[s].astype(np.float32), query="OCCLUDED") >= 0,
-            len(origins),
-        )
+        chunks = _in_chunks(lambda s: self.blocked(self.local(origins[s]), directions[s].astype(np.float32)), len(origins))
         return np.concatenate(chunks) if chunks else np.zeros(0, bool)
+
+    def blocked(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> Bool:
+        """`occluded` of few rays, from `local` origins."""
+        found: Bool = self._scene.run(origins, directions, query="OCCLUDED") >= 0
+        return found
 
 
 @lru_cache(maxsize=1)
@@ -134,11 +138,13 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
 def shadows(caster: RayCaster, points: Float, normal: Float, lights: Float) -> Bool:
     """The same for points of the mesh (n, 3) with its unit normals there (n, 3); nothing hides a light from a point whose normal is 0."""
     shadow = np.zeros((len(points), len(lights)), bool)
-    origins = points + caster.offset * normal
-    # A ray takes a hundred bytes on its way and one in the answer.
+    origins, directions = caster.local(points + caster.offset * normal), lights.astype(np.float32)
+    # A ray takes some forty bytes on its way and one in the answer.
     step = max(1, RAYS_PER_CALL // max(1, len(lights)))
     for start in range(0, len(points), step):
         part = slice(start, start + step)
-        rows, columns = np.nonzero(normal[part] @ lights.T > 0)
-        shadow[start + rows, columns] = caster.occluded(origins[part][rows], lights[columns])
+        above = normal[part] @ lights.T > 0
+        columns = np.nonzero(above)[1]
+        if len(columns):
+            shadow[part][above] = caster.blocked(np.repeat(origins[part], above.sum(1), axis=0), directions[columns])
     return shadow

@@ -10,7 +10,16 @@ import torch
 import trimesh
 from sphere_scene import RADIUS, SphereScene, make_sphere
 
-from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, tangents, vertex_derivatives, vertex_equations
+from mvps.joint.blocks import (
+    DirectionalLights,
+    Vertices,
+    evaluate,
+    law_derivatives,
+    light_jacobian,
+    tangents,
+    vertex_derivatives,
+    vertex_equations,
+)
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights
 from mvps.scene import Law, Surface
@@ -24,6 +33,7 @@ SITUATIONS = {
     "moving vertex seen at a grazing angle": ((1.0, 0.0, 0.1), (0.6, 0.3, 1.0), 20.0),
     "rotating light in a sharp lobe": ((0.1, 0.05, 1.0), (0.2, 0.1, 1.0), 300.0),
     "attached shadow": ((0.1, 0.0, 1.0), (1.0, 0.0, -0.3), 20.0),
+    "light from behind, opposite to the view": ((0.1, 0.0, 1.0), (-0.05, -0.1, -0.99), 20.0),
 }
 
 
@@ -53,7 +63,7 @@ def test_derivatives_against_finite_differences(situation: str, microfacet: bool
     assert torch.allclose(by_vertex, torch.cat([numeric[0], numeric[1][0]]), atol=1e-10)
     assert torch.allclose(by_light, numeric[2][0], atol=1e-10)
     step = 1e-6
-    by_law = (shaded.grazing, shaded.indirect)
+    by_law = law_derivatives(shaded, reflectance, lights, law)
     for name, derivative in zip(("grazing", "bounce"), by_law, strict=True):
         after, before = (
             evaluate(normal, reflectance, view, lights, replace(law, **{name: getattr(law, name) + s}), gathered).predicted

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 
 from solvers.adam import Adam
 from solvers.bounded import minimise
-from solvers.least_squares import bounded_step, cauchy_weights, weighted_rows
+from solvers.least_squares import bounded_step, cauchy_weights, columns_of_inverse, weighted_rows
 from solvers.linear import CholeskyLike
 from solvers.low_rank import factorise, robust_weights, solve_rows
 
@@ -85,6 +85,19 @@ def test_bounded_step_lowers_the_objective_like_a_bounded_solver(seed: int) -> N
     start, best, reached = (0.5 * np.sum((J @ d + r) ** 2) for d in (np.zeros(5), exact.x, step))
     # Fixing never releases a bound again, so the step may be a little short of the optimum, never worse than standing still.
     assert best - 1e-9 <= reached <= start - 0.9 * (start - best)
+
+
+@pytest.mark.parametrize(("problems", "unknowns"), [(1, 3), (4, 1), (50, 4)])
+def test_small_problems_are_solved_each_for_itself_and_stay_as_they_are(problems: int, unknowns: int) -> None:
+    rng = np.random.default_rng(problems)
+    J, r = rng.normal(size=(problems, 12, unknowns)), rng.normal(size=(problems, 12, 1))
+    H, g = (torch.tensor(a) for a in (J.transpose(0, 2, 1) @ J, (J.transpose(0, 2, 1) @ r)[..., 0]))
+    given = [a.clone() for a in (H, g)]
+    step = bounded_step(H, g, torch.full_like(g, -torch.inf), damping=0.0)
+    inverse = columns_of_inverse(H, 1, damping=0.0)[..., 0]
+    assert np.allclose(step, -np.linalg.solve(H.numpy(), g.numpy()[..., None])[..., 0], rtol=1e-4)
+    assert np.allclose(inverse, np.linalg.inv(H.numpy())[..., 0], rtol=1e-4, atol=1e-8)
+    assert all(torch.equal(a, b) for a, b in zip((H, g), given, strict=True))
 
 
 @pytest.mark.parametrize("rank", [0, 1, 2])

@@ -30,7 +30,7 @@ from torch.nn.utils.rnn import pad_sequence
 from mvps.cores import on_cores
 from mvps.joint.observe import ViewSamples
 from mvps.scene import GRAZING_POWER, Law
-from mvps.shading import PARALLEL, half_dot_normal, lobe
+from mvps.shading import half_length, lobe
 from solvers.low_rank import CAUCHY_95
 
 WORKERS = 2
@@ -152,7 +152,8 @@ def batches(views: list[ViewSamples], lights: list[DirectionalLights]) -> Iterat
 @dataclass(frozen=True)
 class Shaded:
     """The image model on a batch of pairs, (..., n, lights) each: lit 1 above the horizon; n . l clamped at 0; h . n; c; basis dI/da and
-    q E_k; reflectance R; slope B; of_light a D_l' D_v, of_view a D_l D_v'; grazing dI/dg; indirect a e G; predicted I."""
+    q E_k; reflectance R; slope B; of_light a D_l' D_v, of_view a D_l D_v'; missing (1 - n.l)^p and (1 - n.v)^p (..., n, 1); indirect
+    a e G; predicted I."""
 
     lit: Tensor
     n_dot_l: Tensor
@@ -163,7 +164,7 @@ class Shaded:
     slope: Tensor
     of_light: Tensor
     of_view: Tensor
-    grazing: Tensor
+    missing: tuple[Tensor, Tensor]
     indirect: Tensor
     predicted: Tensor
 
@@ -174,22 +175,21 @@ def evaluate(
     """The image model for normal, towards (..., n, 3) and reflectance (..., n, 1 + lobes) under all lights of a view, or of several that
     stand first (Batch). gathered (..., n, lights): G."""
     light, intensity = lights.direction, lights.intensity
-    n_dot_l = normal @ light.mT
-    v_dot_l = towards @ light.mT
+    n_dot_l = (normal @ light.mT).clamp_min(0)
     n_dot_v = (normal * towards).sum(-1, keepdim=True)
-    half = half_dot_normal(n_dot_v, n_dot_l, v_dot_l)
-    c = (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
-    lit = (n_dot_l > 0).to(normal.dtype)
-    n_dot_l = n_dot_l.clamp_min(0)
-    q = n_dot_l * intensity
-    albedo = reflectance[..., :1]
+    c = half_length(towards @ light.mT)
+    # Below the horizon h . n is of no account, there is no light; but it must not grow with a light opposite to the view.
+    half = ((n_dot_v + n_dot_l) / c).clamp_max_(1)
+    q, albedo = n_dot_l * intensity, reflectance[..., :1]
     (of_l, slope_l), (of_v, slope_v) = _grazing(n_dot_l), _grazing(n_dot_v.clamp_min(0))
-    D_l, D_v = 1 + law.grazing * of_l, 1 + law.grazing * of_v
-    total = albedo * D_l * D_v
-    grazing = q * (albedo * (of_l * D_v + of_v * D_l))
-    indirect = torch.zeros_like(q) if gathered is None else albedo * intensity * gathered
-    slope = torch.zeros_like(q)
-    basis = [q * (D_l * D_v) + (0 if gathered is None else law.bounce * intensity * gathered)]
+    # Factors of a point alone are multiplied before those of its samples.
+    D_l, D_v, slant = 1 + law.grazing * of_l, 1 + law.grazing * of_v, albedo * law.grazing
+    D = D_l * D_v
+    total, slope, basis = albedo * D, torch.zeros_like(q), [q * D]
+    indirect = torch.zeros_like(q)
+    if gathered is not None:
+        unit = intensity * gathered
+        basis, indirect = [basis[0] + law.bounce * unit], albedo * unit
     for k, s in enumerate(law.sharpness):
         value, steepness = lobe(half, s, law.microfacet)
         weighted = value * reflectance[..., k + 1, None]
@@ -197,8 +197,8 @@ def evaluate(
         slope = slope + steepness * weighted
         basis.append(q * value)
     predicted = q * total + law.bounce * indirect
-    of_light, of_view = albedo * law.grazing * slope_l * D_v, albedo * law.grazing * D_l * slope_v
-    return Shaded(lit, n_dot_l, half, c, basis, total, slope, of_light, of_view, grazing, indirect, predicted)
+    of_light, of_view = slant * D_v * slope_l, slant * slope_v * D_l
+    return Shaded(n_dot_l.sign(), n_dot_l, half, c, basis, total, slope, of_light, of_view, (of_l, of_v), indirect, predicted)
 
 
 def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
@@ -229,6 +229,13 @@ def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: Dire
     gamma = law.bounce * shaded.indirect / lights.intensity - (along_normal * shaded.n_dot_l + beta * v_dot_l)
     n, v, light = (a @ rotation.mT for a in (normal, towards, lights.direction))
     return alpha[..., None, :] * n[..., None] + beta[..., None, :] * v[..., None] + gamma[..., None, :] * light.mT[..., None, :, :]
+
+
+def law_derivatives(shaded: Shaded, reflectance: Tensor, lights: DirectionalLights, law: Law) -> list[Tensor]:
+    """Derivatives (..., n, lights) of the samples by the law's grazing and bounce; reflectance (..., n, 1 + lobes)."""
+    of_l, of_v = shaded.missing
+    changed = of_l * (1 + law.grazing * of_v) + (1 + law.grazing * of_l) * of_v
+    return [reflectance[..., :1] * lights.intensity * shaded.n_dot_l * changed, shaded.indirect]
 
 
 def robust(residual: Tensor, scale: Tensor) -> Tensor:

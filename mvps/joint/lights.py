@@ -31,6 +31,7 @@ from mvps.joint.blocks import (
     Vertices,
     batches,
     evaluate,
+    law_derivatives,
     light_jacobian,
     robust,
     tangents,
@@ -124,13 +125,13 @@ def _sums(
     first, second = tangents(vertices.normal)
     for batch in batches(views, lights):
         index, towards = batch.vertex, batch.towards
-        normal, scale = vertices.normal[index], vertices.scale[index]
-        shaded = evaluate(normal, vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
+        normal, reflectance, scale = (values[index] for values in (vertices.normal, vertices.reflectance, vertices.scale))
+        shaded = evaluate(normal, reflectance, towards, batch.lights, law, batch.gathered)
         residual = shaded.predicted - batch.image
         weight = batch.weight * robust(residual, scale)
         batch.added(sums.count, weight.sum(-1))
         of_vertex = vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights)
-        rows = torch.stack([*of_vertex, shaded.grazing, shaded.indirect, residual], -2)
+        rows = torch.stack([*of_vertex, *law_derivatives(shaded, reflectance, batch.lights, law), residual], -2)
         weighted = rows * (weight / scale[..., None] ** 2)[..., None, :]
         batch.added(sums.vertices, weighted @ rows.mT)
         if not size:

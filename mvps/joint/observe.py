@@ -99,7 +99,10 @@ def grey_radiance(view: View, intensity: Float) -> tuple[NDArray[np.float32], ND
     """Of a view's foreground pixels (pixels, lights): grey radiance, what is left of a light being its mean intensity, and where no
     channel is saturated."""
     per_channel = (view.scale / (3 * channel_ratio(intensity))).astype(np.float32)
-    return np.einsum("plc,lc->pl", view.samples, per_channel), view.usable()
+    red, green, blue = (view.samples[..., c] * per_channel[:, c] for c in range(3))
+    red += green
+    red += blue
+    return red, view.usable()
 
 
 def _sampled(

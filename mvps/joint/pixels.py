@@ -57,7 +57,8 @@ def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: 
 
 def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
     """(n, 3) share of the channels in a pixel's radiance under white light, mean 1."""
-    white = (view.samples[rows] * (view.shown[:, None] / channel_ratio(intensity)).astype(np.float32)).sum(1)
+    samples, per_channel = view.samples[rows], (view.shown[:, None] / channel_ratio(intensity)).astype(np.float32)
+    white = np.column_stack([np.einsum("pl,l->p", samples[..., c].astype(np.float32), per_channel[:, c]) for c in range(3)])
     chroma: NDArray[np.float32] = white / np.maximum(white.mean(1, keepdims=True), 1e-12)
     return chroma
 

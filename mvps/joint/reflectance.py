@@ -11,7 +11,7 @@ is linear in g and in r, which are solved in turn as robust ratios of sums. One 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,32 +75,49 @@ class _Sums(NamedTuple):
     light_weight: Float
 
 
-def _sums(of: Observed, i: int, ratio: NDArray[np.float32], colour: NDArray[np.float32]) -> _Sums:
-    """Those of view i."""
-    n, count = len(of.views[i].vertex), len(ratio)
-    out = _Sums(np.zeros((n, 3)), np.zeros(n), np.zeros((count, 3)), np.zeros((count, 3)))
+class _Told(NamedTuple):
+    """What a chunk says of colours, whatever they are: part and rows of the chunk; P and P^2 with the weights (n, lights); image."""
+
+    part: slice
+    rows: Int
+    predicted: NDArray[np.float32]
+    squared: NDArray[np.float32]
+    image: NDArray[np.float32]
+
+
+def _told(of: Observed, i: int) -> list[_Told]:
+    """All of view i."""
+    told = []
     for chunk in chunks(of, i):
-        predicted, image = chunk.predicted, chunk.image
-        body = chunk.weight * (chunk.diffuse / np.maximum(predicted, 1e-12)) ** 2
-        out.colour[chunk.part] = np.einsum("pl,plc->pc", body * predicted, image / ratio)
-        out.colour_weight[chunk.part] = (body * predicted**2).sum(1)
-        out.light[:] += np.einsum("pl,plc,pc->lc", body * predicted, image, colour[chunk.rows])
-        out.light_weight[:] += np.einsum("pl,pc->lc", body * predicted**2, colour[chunk.rows] ** 2)
+        body: Any = chunk.weight * (chunk.diffuse / np.maximum(chunk.predicted, 1e-12)) ** 2
+        told.append(_Told(chunk.part, chunk.rows, body * chunk.predicted, body * chunk.predicted**2, chunk.image))
+    return told
+
+
+def _sums(told: list[_Told], pairs: int, ratio: NDArray[np.float32], colour: NDArray[np.float32]) -> _Sums:
+    """Those of a view with so many pairs."""
+    count = len(ratio)
+    out = _Sums(np.zeros((pairs, 3)), np.zeros(pairs), np.zeros((count, 3)), np.zeros((count, 3)))
+    for part, rows, predicted, squared, image in told:
+        out.colour[part] = np.einsum("pl,plc->pc", predicted, image / ratio)
+        out.colour_weight[part] = squared.sum(1)
+        out.light[:] += np.einsum("pl,plc,pc->lc", predicted, image, colour[rows])
+        out.light_weight[:] += np.einsum("pl,pc->lc", squared, colour[rows] ** 2)
     return out
-
-
-def _all_sums(of: Observed, ratios: list[Float], colour: NDArray[np.float32]) -> list[_Sums]:
-    return on_cores(lambda i: _sums(of, i, ratios[i].astype(np.float32), colour), range(len(of.views)))
 
 
 def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:
     """Per view the lights' channel ratios (lights, 3), from `ratios` on. The samples of some thousand vertices are enough."""
     colour = np.ones((len(of.vertices.normal), 3), np.float32)
+    told = on_cores(lambda i: _told(of, i), range(len(of.views)))
+
+    def sums() -> list[_Sums]:
+        return on_cores(lambda i: _sums(told[i], len(of.views[i].vertex), ratios[i].astype(np.float32), colour), range(len(told)))
+
     for _ in range(COLOUR_SWEEPS):
-        sums = _all_sums(of, ratios, colour)
-        top, bottom = _over_views(of.views, [(s.colour, s.colour_weight) for s in sums], len(colour))
+        top, bottom = _over_views(of.views, [(s.colour, s.colour_weight) for s in sums()], len(colour))
         colour = (top / np.maximum(bottom, 1e-12)[:, None]).astype(np.float32)
-        ratios = _ratios([(s.light, s.light_weight) for s in _all_sums(of, ratios, colour)], one_rig)
+        ratios = _ratios([(s.light, s.light_weight) for s in sums()], one_rig)
     return ratios
 
 
