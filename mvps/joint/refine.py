@@ -19,6 +19,7 @@ from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
+from mvps.joint.detail import detailed, interpolated
 from mvps.joint.fused import face_targets
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
@@ -39,7 +40,7 @@ from mvps.joint.pixels import few_lights
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.unseen import closed_over
-from mvps.joint.vertices import fuse, with_masks
+from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
@@ -98,7 +99,8 @@ class RefineSettings:
     held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
     last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
     the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels and more, or for
-    Stage I, which draws fewer rays than there are pixels; model: all that the reflectance may have."""
+    Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last round's (detail.py); model: all
+    that the reflectance may have."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
@@ -106,6 +108,7 @@ class RefineSettings:
     in_full: bool = False
     for_field: bool = False
     half: bool = False
+    detail: bool = False
     model: Model = LARGEST
 
 
@@ -152,7 +155,7 @@ def _agreement_of(state: State, capture: Capture, seen: list[Any], settings: Rou
 
 def _moved(
     surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
-) -> Surface:
+) -> Moved:
     """The surface moved to where views and masks agree, with the views' normals; what no view sees follows smoothly. otherwise (V, 3):
     normals where no view sees."""
     floor = POSITION_FLOOR_PIXELS * pixel
@@ -160,11 +163,12 @@ def _moved(
     factor, agreement_of = None, _agreement_of(state, capture, seen, settings, pixel)
     for _ in range(settings.fusions):
         agreed = with_masks(agreement_of(surface), capture, surface, distance, floor)
+        place = surface.vertices + agreed.offset[:, None] * vertex_normals(surface)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
     known = np.zeros(len(surface.vertices), bool)
     known[np.concatenate(seen)] = True
-    return closed_over(unbiased(surface), known, capture, distance)
+    return Moved(closed_over(unbiased(surface), known, capture, distance), place, agreed.sigma)
 
 
 def _remeshed(
@@ -222,9 +226,10 @@ def refine(
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
             seen, changes = [index for index, _ in visible_in(capture, state.surface)], {}
-        moved = state.surface
+        moved, told = state.surface, None
         if not leaves_surface:
-            moved = _moved(state.surface, mesh_normal, state, capture, seen, round_settings, pixel)
+            told = _moved(state.surface, mesh_normal, state, capture, seen, round_settings, pixel)
+            moved = told.surface
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
         far = changes["vertex_change_px"] > round_settings.reach
@@ -239,7 +244,11 @@ def refine(
         before = None if far and again else round_settings
         account.append({"round": float(len(account) + 1), "vertices": float(len(shift)), "creased": creased, **changes})
         on_round(len(account), account[-1])
-    return replace(finished(state, settings, account, generator), carried=carried)
+    result = replace(finished(state, settings, account, generator), carried=carried)
+    if told is None or not settings.detail:
+        return result
+    surface, share = detailed(capture, told, state.maps, seen, NORMAL_SIGMA)
+    return replace(result, surface=surface, material=interpolated(result.material, share))
 
 
 def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Material:

@@ -15,6 +15,8 @@ radians, a the mean area of a vertex (normals are independent from vertex to ver
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import igl
 import numpy as np
 import scipy.sparse as sp
@@ -44,6 +46,15 @@ often."""
 
 ALONG = 0.5
 """Least slope of the distance to a mask along an outline's normal, 1 where they are parallel; below it another part is nearer."""
+
+
+class Moved(NamedTuple):
+    """A surface, and where views and masks agreed that its vertices lie before normals had their say: place (V, 3), sigma (V,) standard
+    deviation, infinite where they do not say; world units."""
+
+    surface: Surface
+    place: Float
+    sigma: Float
 
 
 def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: list[NDArray[np.float32]], floor: float) -> Agreement:
