@@ -46,7 +46,7 @@ def inputs(normal: Tensor, view: Tensor, light: Tensor, code: Tensor) -> Tensor:
     """(n, lights, 9 + descriptors) the network's x for codes (n, MOMENTS + descriptors); the rest as in `moments`."""
     n_dot_l, v_dot_l = against(normal, light).clamp_min(0), against(view, light)
     n_dot_v = (normal * view).sum(-1, keepdim=True).clamp_min(0)
-    half = half_dot_normal(n_dot_v, n_dot_l, v_dot_l).clamp(-1, 1)
+    half = half_dot_normal(n_dot_v, n_dot_l, v_dot_l)
     away = 1 - half
     terms = moments(normal, view, light) * code[:, None, :MOMENTS]
     said = [terms[..., part].sum(-1).clamp(-LARGEST, LARGEST) for part in (slice(0, 1), slice(1, 4), slice(4, MOMENTS))]

@@ -45,8 +45,9 @@ def half_length(v_dot_l: Tensor) -> Tensor:
 
 
 def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor:
-    """h . n for n . v (points, 1), n . l (points, lights) and v . l (points, lights)."""
-    return (n_dot_v + n_dot_l) / half_length(v_dot_l)
+    """h . n for n . v (points, 1), n . l (points, lights) and v . l (points, lights). Where view and light are opposite, rounding would
+    take it out of [-1, 1]."""
+    return ((n_dot_v + n_dot_l) / half_length(v_dot_l)).clamp(-1, 1)
 
 
 def lobe(h_dot_n: Tensor, sharpness: float, microfacet: bool) -> tuple[Tensor, Tensor | float]:

@@ -45,6 +45,15 @@ def test_opposite_view_and_light_stay_finite() -> None:
     assert torch.isfinite(shaded(unit(1, 0, 0.001), unit(-1, 0, -0.001))).all()
 
 
+def test_rounding_near_opposite_view_and_light_makes_no_highlight() -> None:
+    g = torch.Generator().manual_seed(0)
+    view = torch.nn.functional.normalize(torch.randn(2000, 3, generator=g), dim=1)
+    light = torch.nn.functional.normalize(-view + 1e-3 * torch.randn(2000, 3, generator=g), dim=1)
+    normal = torch.nn.functional.normalize(view + light, dim=1)
+    values = shade(normal, view, light[:, None], torch.ones(2000, 3), torch.ones(2000, 1), Law((256.0,)))
+    assert values.max() <= 2
+
+
 def test_half_vector_against_its_definition() -> None:
     view, light = unit(0.2, -0.5, 1), unit(-0.6, 0.3, 0.8)
     half = torch.nn.functional.normalize(view + light, dim=1)

@@ -179,7 +179,7 @@ def evaluate(
     n_dot_v = (normal * towards).sum(-1, keepdim=True)
     c = half_length(towards @ light.mT)
     # Below the horizon h . n is of no account, there is no light; but it must not grow with a light opposite to the view.
-    half = ((n_dot_v + n_dot_l) / c).clamp_max_(1)
+    half = ((n_dot_v + n_dot_l) / c).clamp_(-1, 1)
     q, albedo = n_dot_l * intensity, reflectance[..., :1]
     (of_l, slope_l), (of_v, slope_v) = _grazing(n_dot_l), _grazing(n_dot_v.clamp_min(0))
     # Factors of a point alone are multiplied before those of its samples.

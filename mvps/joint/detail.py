@@ -2,10 +2,11 @@
 
 A vertex's reflectance costs a least-squares problem under all lights of all views that see it; the pixels' normals are there already. So
 edges along which the surface turns by more than pixels err are split in the middle, and faces follow the pixels' normals once more
-(vertices.py). What is smoother than normals is interpolated, with rows of 1 or of 1/2 and 1/2 in P (V', V):
+(vertices.py). Reflectance is interpolated, albedo' = P albedo with rows of 1 or of 1/2 and 1/2 in P (V', V). Positions are known of the
+coarse vertices alone, since the middle of an edge lies beside the surface; there the normals count for every vertex (vertices.py), so that
+the same weight against them takes
 
-    t' = P t,  sigma' = P sigma      agreed positions; neighbours share their error, so that two know no better than one
-    albedo' = P albedo, ...          reflectance
+    sigma' = sigma sqrt(V / V')
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from mvps.joint.vertices import Moved, fuse
 from mvps.mesh import edges, lengths, normalise, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, Int, Material, NormalMap, Surface
 
+OPPOSITE = 1e-3
+"""Length of the mean of two unit normals below which it says nothing."""
+
 
 class Detailed(NamedTuple):
     """surface: the finer one; share (V', V): what its vertices take from those of the coarser one."""
@@ -41,30 +45,35 @@ def detailed(capture: Capture, coarse: Moved, maps: tuple[NormalMap, ...], seen:
     normal, pairs = vertex_normals(given), edges(given)
     turning = lengths(np.subtract(*normal[pairs.T])) > error
     surface, pairs = split_edges(given, turning), pairs[turning]
-    share = sp.identity(len(sigma), format="csr")
+    share = sp.identity(len(place), format="csr")
     share = sp.vstack([share, (share[pairs[:, 0]] + share[pairs[:, 1]]) / 2], format="csr")
-    place, sigma = (np.concatenate([values, values[pairs].mean(1)]) for values in (place, sigma))
-    visible: list[Int] = []
-    for index in seen:
-        before = np.isin(np.arange(len(normal)), index)
-        visible.append(np.flatnonzero(np.concatenate([before, before[pairs].all(1)])))
+    views = np.zeros((len(place), len(seen)), bool)
+    for i, index in enumerate(seen):
+        views[index, i] = True
     outward = vertex_normals(surface)
+    offset, spread = np.zeros(len(outward)), np.full(len(outward), np.inf)
+    offset[: len(place)] = np.einsum("vc,vc->v", place - given.vertices, outward[: len(place)])
+    # What no view sees has been closed over since masks spoke.
+    spread[: len(place)] = np.where(views.any(1), sigma * np.sqrt(len(place) / len(outward)), np.inf)
+    visible: list[Int] = [np.flatnonzero(of_view) for of_view in np.concatenate([views, views[pairs].all(1)]).T]
     target = face_targets(capture, surface, maps, visible, outward)
-    offset = np.einsum("vc,vc->v", place - surface.vertices, outward)
-    return Detailed(unbiased(fuse(surface, target, Agreement(offset, sigma), error)[0]), share)
+    return Detailed(unbiased(fuse(surface, target, Agreement(offset, spread), error)[0]), share)
 
 
-def interpolated(material: Material, share: sp.csr_matrix) -> Material:
-    """The material on vertices that take `share` (V', V) of its own."""
+def interpolated(material: Material, of: Detailed) -> Material:
+    """The material on the finer surface's vertices."""
+    share = of.share
 
     def at(values: NDArray[Any]) -> NDArray[Any]:
         mixed: NDArray[Any] = share @ values.reshape(len(values), math.prod(values.shape[1:]))
         return mixed.reshape(share.shape[0], *values.shape[1:]).astype(values.dtype)
 
-    residual = material.residual
+    residual, mean = material.residual, at(material.normal)
+    # Of two opposite normals there is no mean.
+    opposite = lengths(mean) < OPPOSITE
     return replace(
         material,
-        normal=normalise(at(material.normal)),
+        normal=np.where(opposite[:, None], vertex_normals(of.surface), normalise(mean)),
         albedo=at(material.albedo),
         specular_weight=at(material.specular_weight),
         confidence=at(material.confidence),

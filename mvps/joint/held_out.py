@@ -12,6 +12,7 @@ import torch
 from mvps.bounce import coarse_sources
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
+from mvps.joint.photometry import LIGHT_VERTICES, drawn
 from mvps.joint.reflectance import Observed, light_ratios
 from mvps.scene import Capture, Float, Law, Lights, Material, Surface
 
@@ -110,5 +111,7 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
         for _ in range(STEPS):
             grey = _step(views, vertices, grey, material.law, rotations, one_rig)
     ratios = [channel_ratio(e) for e in white]
-    ratios = light_ratios(Observed(capture, surface, views, vertices, grey, material.law), ratios, one_rig)
+    some = drawn(views, LIGHT_VERTICES, np.random.default_rng(0))
+    rows = [samples.of_vertices(some, len(vertices.normal)) for samples in views]
+    ratios = light_ratios(Observed(capture, surface, rows, vertices, grey, material.law), ratios, one_rig)
     return _as_lights(grey, ratios, one_rig)

@@ -64,6 +64,12 @@ class ViewSamples:
         gathered = None if self.gathered is None else self.gathered[rows]
         return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered)
 
+    def of_vertices(self, some: Tensor, count: int) -> ViewSamples:
+        """Only the pairs of some of the mesh's `count` vertices, indices (n,)."""
+        chosen = torch.zeros(count, dtype=torch.bool, device=some.device)
+        chosen[some] = True
+        return self.of_pairs(chosen[self.vertex].nonzero()[:, 0])
+
     def of_lights(self, rows: slice | Tensor) -> ViewSamples:
         """Only some of the lights."""
         image, data, gathered = (None if a is None else a[:, rows].contiguous() for a in (self.image, self.data, self.gathered))

@@ -194,9 +194,7 @@ def _solve_lights(
 def _with_colours(state: State, capture: Capture, few: list[ViewSamples], some: torch.Tensor) -> Lights:
     """The lights with colours from some vertices."""
     assert state.vertices is not None
-    chosen = torch.zeros(len(state.vertices.normal), dtype=torch.bool, device=some.device)
-    chosen[some] = True
-    rows = [samples.of_pairs(chosen[samples.vertex].nonzero()[:, 0]) for samples in few]
+    rows = [samples.of_vertices(some, len(state.vertices.normal)) for samples in few]
     ratios, grey = [channel_ratio(e) for e in state.lights.intensity], grey_lights(state.lights, some.device)
     ratios = light_ratios(Observed(capture, state.surface, rows, state.vertices, grey, state.law), ratios, state.lights.one_rig)
     return coloured_lights(grey, ratios, state.lights.one_rig)

@@ -247,8 +247,8 @@ def refine(
     result = replace(finished(state, settings, account, generator), carried=carried)
     if told is None or not settings.detail:
         return result
-    surface, share = detailed(capture, told, state.maps, seen, NORMAL_SIGMA)
-    return replace(result, surface=surface, material=interpolated(result.material, share))
+    finer = detailed(capture, told, state.maps, seen, NORMAL_SIGMA)
+    return replace(result, surface=finer.surface, material=interpolated(result.material, finer))
 
 
 def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Material:

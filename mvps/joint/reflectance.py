@@ -107,7 +107,8 @@ def _sums(told: list[_Told], pairs: int, ratio: NDArray[np.float32], colour: NDA
 
 
 def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:
-    """Per view the lights' channel ratios (lights, 3), from `ratios` on. The samples of some thousand vertices are enough."""
+    """Per view the lights' channel ratios (lights, 3), from `ratios` on. All samples are kept meanwhile: those of some thousand vertices
+    are enough."""
     colour = np.ones((len(of.vertices.normal), 3), np.float32)
     told = on_cores(lambda i: _told(of, i), range(len(of.views)))
 
