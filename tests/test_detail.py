@@ -51,7 +51,7 @@ def test_reflectance_between_two_vertices_is_their_mean() -> None:
     assert np.allclose(np.linalg.norm(found.normal, axis=1), 1) and np.allclose(found.normal[0], material.normal[0])
     residual = found.residual
     assert residual is not None and np.allclose(residual.code, [[0, 1], [1, 2], [4, 5]]) and np.array_equal(residual.share, [1, 1, 1])
-    assert interpolated(replace(material, specular_weight=np.zeros((count, 0))), of).specular_weight.shape == (3, 0)
+    assert interpolated(replace(material, specular_weight=np.zeros((count, 0)), sharpness=np.zeros(0)), of).specular_weight.shape == (3, 0)
 
 
 def test_opposite_normals_have_no_mean() -> None:
