@@ -58,8 +58,9 @@ def error(run: Run, key: str, digits: int = 2) -> str:
 
 
 def against(runs: Mapping[str, Runs], better: str, worse: str, key: str) -> tuple[str, bool]:
-    """The error of two methods on every capture, as text, and whether the first is lower on all of them."""
-    pairs = [(name, of[better], of[worse]) for name, of in runs.items() if key in of[better].errors and key in of[worse].errors]
+    """The error of two methods on every capture that has both, as text, and whether the first is lower on all of them."""
+    found = [(name, of.get(better), of.get(worse)) for name, of in runs.items()]
+    pairs = [(name, a, b) for name, a, b in found if a and b and key in a.errors and key in b.errors]
     text = ", ".join(f"{name} {error(b, key)} against {error(a, key)}" for name, a, b in pairs)
     return text, bool(pairs) and all(a.errors[key] < b.errors[key] for _, a, b in pairs)
 
