@@ -17,12 +17,10 @@ import numpy as np
 from mvps import measures
 from mvps.device import chosen_device
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
-from mvps.joint.thinned import thinned
 from mvps.load import read_capture, read_truth
-from mvps.photometric import normal_maps
-from mvps.plan import Parts, carving_pass, first_pass
+from mvps.plan import Parts
 from mvps.progress import Progress
-from mvps.reconstruct import Settings, first_lights, rough_shape, shaped, stage_two
+from mvps.reconstruct import Settings, coarse
 from mvps.scene import Capture, Lights, NormalMap, Truth
 
 HERE = Path(__file__).resolve().parent
@@ -45,11 +43,7 @@ def trajectory(path: Path, rounds: int) -> list[dict[str, float]]:
     """One record of errors a round."""
     capture, truth, settings, progress = read_capture(path), read_truth(path), Settings(str(path)), Progress()
     device = chosen_device(settings.device)
-    grid, hull = rough_shape(capture, progress)
-    lights = first_lights(capture, hull, None, settings.seed, progress)
-    maps = normal_maps(*thinned(capture, lights), device)
-    rough = stage_two("first refinement", capture, hull, lights, maps, Parts().law(), first_pass(True, False), settings, progress)
-    state, _ = shaped(capture, grid, rough, settings, carving_pass(True), progress)
+    state, _ = coarse(capture, settings, None, Parts(), progress, lambda _, make: make())
     records = []
     one = RefineSettings((RoundSettings(EDGE, REACH, STEP),))
     for k in range(rounds):

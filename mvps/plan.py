@@ -72,9 +72,9 @@ def carving_pass(free_lights: bool) -> RefineSettings:
     return RefineSettings((COARSE,), free_lights=free_lights, half=True)
 
 
-def last_pass(preset: str, free_lights: bool, few_lights: bool) -> RefineSettings:
-    """Rounds after Stage I; sweeps reach as far as Stage I may be off. few_lights: fewer of a view than tell a normal. Then Stage I had
-    nothing but vertices' normals to go by, and photographs have farther to pull the surface."""
+def last_pass(preset: str, free_lights: bool, far: bool) -> RefineSettings:
+    """Rounds after Stage I; sweeps reach as far as Stage I may be off. far: photographs have farther to pull the surface, because Stage I
+    saw them at half their size, or had nothing but vertices' normals to go by, of views with fewer lights than tell a normal."""
     first = RoundSettings(2.0, 1.2, 0.3, crease=0.1)
     rounds = {
         "standard": (first, replace(first, for_detail=True)),
@@ -84,6 +84,6 @@ def last_pass(preset: str, free_lights: bool, few_lights: bool) -> RefineSetting
             RoundSettings(0.8, 0.6, 0.2, crease=0.1),
         ),
     }[preset]
-    if few_lights:
+    if far:
         rounds = (replace(COARSE, still=STILL_PIXELS), *rounds)
     return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)

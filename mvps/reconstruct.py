@@ -34,6 +34,9 @@ PRESETS = ("draft", "standard", "fine")
 Numbers = Sequence[int]
 LightNumbers = Numbers | Mapping[str, Numbers]
 
+Step = Callable[[str, Callable[[], Any]], Any]
+"""Makes what a long stage makes, under its name; or takes it from where it was kept."""
+
 TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
@@ -154,9 +157,7 @@ def shaped(
     for turn in range(MOST_TURNS):
         if turn:
             surface = stage_one(field, refined.maps, CONTINUED, progress)
-        refined = stage_two(
-            "coarse refinement", capture, surface, refined.lights, refined.maps, refined.law, of_turn, settings, progress, carried
-        )
+        refined = stage_two("coarse refinement", capture, surface, refined, of_turn, settings, progress, carried)
         residuals = [one["residual"] for one in rounds + refined.rounds if "residual" in one]
         rounds, carried = rounds + refined.rounds, refined.carried
         fits = residuals[-1] <= POOR_FIT and refined.rounds[-1]["light_change_deg"] <= MOVING_DEG
@@ -169,15 +170,13 @@ def stage_two(
     name: str,
     capture: Capture,
     surface: Surface,
-    lights: Lights,
-    maps: tuple[NormalMap, ...],
-    law: Law,
+    of: Begun | Refined,
     plan: RefineSettings,
     settings: Settings,
     progress: Progress,
     carried: tuple[Surface, Any] | None = None,
 ) -> Refined:
-    """Rounds of Stage II under the progress bar."""
+    """Rounds of Stage II under the progress bar, from a surface and the lights, normal maps and image model `of` what came before."""
     from mvps.device import chosen_device
     from mvps.joint.refine import refine
 
@@ -187,17 +186,54 @@ def stage_two(
             stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
 
         device = chosen_device(settings.device)
-        refined = refine(capture, surface, lights, maps, law, plan, settings.seed, device, on_round, carried)
+        refined = refine(capture, surface, of.lights, of.maps, of.law, plan, settings.seed, device, on_round, carried)
         stage.status(refined.status)
     return refined
 
 
 class Begun(NamedTuple):
-    """What Stage II starts with."""
+    """What Stage II starts with: the hull, as a grid too, lights, and the views' photometric stereo under them."""
 
+    grid: SignedDistanceGrid
+    surface: Surface
     lights: Lights
     maps: tuple[NormalMap, ...]
     law: Law
+
+
+def begin(capture: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress) -> Begun:
+    """What photographs and masks say before anything is solved together."""
+    from mvps.device import chosen_device
+    from mvps.joint.thinned import thinned
+    from mvps.photometric import normal_maps
+
+    grid, surface = rough_shape(capture, progress)
+    start = first_lights(capture, surface, lights, settings.seed, progress, parts.one_rig)
+    with progress.stage("photometric stereo"):
+        maps = normal_maps(*thinned(capture, start), chosen_device(settings.device))
+    return Begun(grid, surface, start, maps, parts.law())
+
+
+def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step) -> Refined:
+    """Stage II on the hull alone."""
+    from mvps.plan import first_pass
+
+    begun, plan = begin(used, settings, lights, parts, progress), parts.of(first_pass(lights is None, True))
+    refined: Refined = step("joint refinement", lambda: stage_two("joint refinement", used, begun.surface, begun, plan, settings, progress))
+    return refined
+
+
+def coarse(
+    used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step
+) -> tuple[Refined, list[dict[str, float]]]:
+    """Shape, lights and normals for the last rounds to start from, and the rounds that they took."""
+    from mvps.plan import carving_pass, first_pass
+
+    begun, plan = begin(used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
+    rough = step("first refinement", lambda: stage_two("first refinement", used, begun.surface, begun, plan, settings, progress))
+    turns = parts.of(carving_pass(lights is None))
+    found: tuple[Refined, list[dict[str, float]]] = step("shape", lambda: shaped(used, begun.grid, rough, settings, turns, progress))
+    return found
 
 
 def reconstruct(
@@ -213,43 +249,34 @@ def reconstruct(
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
-    from mvps.joint.thinned import thinned
     from mvps.material import POOR_FIT
-    from mvps.photometric import normal_maps
-    from mvps.plan import Parts, carving_pass, first_pass, last_pass
+    from mvps.plan import Parts, last_pass
+    from mvps.pyramid import for_shape
 
     parts = parts or Parts()
-    device = chosen_device(settings.device)
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     if len(used.views) == 1:
         from mvps.oneview import reconstruct_view
 
         return reconstruct_view(capture, used, held, settings, lights, parts, progress, findings)
-    grid, surface = rough_shape(used, progress)
-    start = first_lights(used, surface, lights, settings.seed, progress, parts.one_rig)
-    with progress.stage("photometric stereo"):
-        maps = normal_maps(*thinned(used, start), device)
-    begun, free = Begun(start, maps, parts.law()), lights is None
 
     def step(name: str, make: Callable[[], Any]) -> Any:
         return make() if checkpoints is None else checkpoints.step(name, make, progress)
 
-    def refined_by(name: str, plan: RefineSettings, surface: Surface, of: Begun | Refined, carried: Any = None) -> Refined:
-        made: Refined = step(name, lambda: stage_two(name, used, surface, of.lights, of.maps, of.law, plan, settings, progress, carried))
-        return made
-
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":
-        refined = refined_by("joint refinement", parts.of(first_pass(free, True)), surface, begun)
+        refined = drafted(used, settings, lights, parts, progress, step)
     else:
-        rough = refined_by("first refinement", parts.of(first_pass(free, False)), surface, begun)
-        turns = parts.of(carving_pass(free))
-        coarse, rounds = step("shape", lambda: shaped(used, grid, rough, settings, turns, progress))
+        level = for_shape(used)
+        far = few_lights(used) or level is not used
+        start, rounds = coarse(level, settings, lights, parts, progress, step)
+        del level
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        plan = parts.of(last_pass(settings.preset, free and coarse.rounds[-1]["residual"] <= POOR_FIT, few_lights(used)))
-        refined = refined_by("joint refinement", plan, coarse.surface, coarse, coarse.carried)
+        free = lights is None and start.rounds[-1]["residual"] <= POOR_FIT
+        plan, name = parts.of(last_pass(settings.preset, free, far)), "joint refinement"
+        refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
     with progress.stage("lights and normals of all views"):
-        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
+        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, chosen_device(settings.device))
         pictures = normal_pictures(capture, used, refined)
     return told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, findings)
 

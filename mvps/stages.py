@@ -20,8 +20,9 @@ from mvps.outcome import all_lights, versions
 from mvps.photometric import normal_maps
 from mvps.plan import Parts, first_pass
 from mvps.progress import Progress
+from mvps.pyramid import for_shape
 from mvps.radiance import RadianceSettings, radiance_surface
-from mvps.reconstruct import Settings, first_lights, parted, rough_shape, stage_one, stage_two
+from mvps.reconstruct import Settings, begin, first_lights, parted, rough_shape, stage_one, stage_two
 from mvps.scene import Capture, Lights, Reconstruction, Surface
 from mvps.visibility import ray_caster
 
@@ -36,15 +37,10 @@ def hull(capture: Capture, settings: Settings, given: Lights | None, progress: P
 
 def stage1(capture: Capture, settings: Settings, given: Lights | None, progress: Progress) -> Reconstruction:
     """What Stage I makes of the normals and lights that Stage II found on the hull."""
-    device = chosen_device(settings.device)
-    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    grid, surface = rough_shape(used, progress)
-    lights = first_lights(used, surface, given, settings.seed, progress)
-    with progress.stage("photometric stereo"):
-        maps = normal_maps(*thinned(used, lights), device)
-    plan = first_pass(given is None, False)
-    rough = stage_two("first refinement", used, surface, lights, maps, Parts().law(), plan, settings, progress)
-    field = Occupancy(used, grid, OccupancySettings(), settings.seed, device)
+    used = for_shape(parted(capture, settings.hold_out_views, settings.hold_out_lights)[0])
+    begun, plan = begin(used, settings, given, Parts(), progress), first_pass(given is None, False)
+    rough = stage_two("first refinement", used, begun.surface, begun, plan, settings, progress)
+    field = Occupancy(used, begun.grid, OccupancySettings(), settings.seed, chosen_device(settings.device))
     surface = stage_one(field, rough.maps, OccupancySettings(), progress)
     return on_surface(capture, surface, rough.lights, settings, progress, "Stage I alone")
 

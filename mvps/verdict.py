@@ -4,6 +4,8 @@ misfit        of the image model, as a share of the images' signal, without the 
 outline_px    area between the mesh's silhouettes and the masks over the masks' outlines: by how far outlines are off, in the mean
 views_deg     median over the vertices of the standard deviation of different views' normals at the same vertex
 expected_deg  mean of the vertices' expected errors: sqrt(pi / 2) times the stated standard deviation along a tangent (stated.py)
+depth_px      mean over the vertices of e L: what one view alone sees has its depth from normals, and with an error of e (expected, radians)
+              all over the distance of L pixels from the nearest vertex that a second view sees, it is e L off; 0 where two views see
 
 Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
 sigma = median |I(x - 1) - 2 I(x) + I(x + 1)| / (0.6745 sqrt(6)); vertices interpolate between four pixels, which leaves two thirds of it.
@@ -15,9 +17,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from mvps.camera import project
-from mvps.cores import on_cores
+from mvps.camera import pixel_footprint, project
+from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.material import POOR_FIT
 from mvps.mesh import normalise
@@ -30,6 +33,10 @@ BAD_DEG = 10.0
 
 CONTRADICTION_DEG = BAD_DEG / np.sqrt(2)
 """Standard deviation between views above which they contradict each other: with as large an error that they share the sum is BAD_DEG."""
+
+DEPTH_PIXELS = 2.0
+"""Of depth_px, which supposes errors of one sign: made objects in three to five views were 0.4 to 1.0 of it off, and off by a pixel in the
+mean they are of no use as a measurement."""
 
 OUTLINE_PIXELS = 1.0
 """Mean error of outlines that masks of whole pixels cannot explain."""
@@ -86,20 +93,36 @@ def outline_px(capture: Capture, surface: Surface) -> float:
     return float(wrong / max(length, 1.0))
 
 
-def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.float32]]) -> float:
-    """Median standard deviation of the normals of views at vertices that several see, degrees; 0 where none is. pictures: the views'
-    normals (height, width, 3), NaN outside the masks."""
+def seen_by(capture: Capture, surface: Surface) -> list[Int]:
+    """Per view the indices of the vertices that it sees."""
     caster = ray_caster(surface)
+    return on_cores(lambda view: np.flatnonzero(visible_vertices(caster, view.camera)), capture.views)
 
-    def of_view(view: View, picture: NDArray[np.float32]) -> tuple[Int, Float]:
-        index = np.flatnonzero(visible_vertices(caster, view.camera))
+
+def depth_px(capture: Capture, surface: Surface, material: Material, seen: Sequence[Int]) -> float:
+    """`depth_px` above, of vertices that each view sees; 0 where no two see the same, as of a single view."""
+    views = np.bincount(np.concatenate(seen), minlength=len(surface.vertices))
+    alone, several = np.flatnonzero((views == 1) & (material.confidence > 0)), views > 1
+    if not len(alone) or not several.any():
+        return 0.0
+    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    away = neighbours(cKDTree(surface.vertices[several]), surface.vertices[alone])[0] / pixel
+    error = np.radians(np.minimum(expected_error_deg(material.confidence[alone]), 90))
+    return float((error * away).sum() / (views > 0).sum())
+
+
+def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.float32]], seen: Sequence[Int]) -> float:
+    """Median standard deviation of the normals of views at vertices that several see, degrees; 0 where none is. pictures: the views'
+    normals (height, width, 3), NaN outside the masks; seen: the vertices that each sees."""
+
+    def of_view(view: View, picture: NDArray[np.float32], index: Int) -> tuple[Int, Float]:
         known = np.nan_to_num(picture)
         normal = sampled(known, project(view.camera, surface.vertices[index])[0]).astype(float)
         found = np.linalg.norm(normal, axis=1) > 0.5
         return index[found], normalise(normal[found])
 
     total, count = np.zeros((len(surface.vertices), 3)), np.zeros(len(surface.vertices))
-    for index, normal in on_cores(of_view, capture.views, pictures):
+    for index, normal in on_cores(of_view, capture.views, pictures, seen):
         total[index] += normal
         count[index] += 1
     several = count > 1
@@ -113,13 +136,14 @@ def signs(
     capture: Capture, surface: Surface, material: Material, pictures: Sequence[NDArray[np.float32]], residual: float
 ) -> dict[str, float]:
     """The figures above. residual: of the last round, as a share of the images' signal."""
-    noise = INTERPOLATED * noise_share(capture)
+    noise, seen = INTERPOLATED * noise_share(capture), seen_by(capture, surface)
     return {
         "misfit": float(np.sqrt(max(residual**2 - noise**2, 0.0))),
         "noise": noise,
         "outline_px": outline_px(capture, surface),
-        "views_deg": views_deg(capture, surface, pictures),
+        "views_deg": views_deg(capture, surface, pictures, seen),
         "expected_deg": expected_deg(material),
+        "depth_px": depth_px(capture, surface, material, seen),
     }
 
 
@@ -141,6 +165,11 @@ def verdict(found: Mapping[str, float], settled: tuple[str, str], findings: Sequ
         )
     if found["expected_deg"] > BAD_DEG:
         doubts.append(f"normals are expected to be {found['expected_deg']:.0f} deg off in the mean")
+    if found["depth_px"] > DEPTH_PIXELS:
+        doubts.append(
+            f"the depth of what one view alone sees may be {found['depth_px']:.0f} px off in the mean over the surface"
+            f" (good ones under {DEPTH_PIXELS:.0f})"
+        )
     if doubts:
         return "doubtful", (
             f"There is reason to doubt this shape: {'; '.join(doubts)}. Look at masks and poses first, then whether there are enough views"

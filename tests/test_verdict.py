@@ -9,12 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sphere_scene import SphereScene, make_sphere
 
+from mvps.camera import pixel_footprint
 from mvps.finding import Finding
 from mvps.scene import RELIABLE, Capture, Surface
-from mvps.verdict import expected_deg, noise_share, outline_px, signs, verdict, views_deg
+from mvps.verdict import depth_px, expected_deg, noise_share, outline_px, seen_by, signs, verdict, views_deg
 
 SETTLED = ("converged", "settled.")
-GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0}
+GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0, "depth_px": 0.1}
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +49,12 @@ def test_outlines_that_are_off(scene: SphereScene) -> None:
 
 def test_views_that_contradict_each_other(scene: SphereScene) -> None:
     surface, maps = scene.reconstruction.surface, list(scene.reconstruction.normal_maps)
-    assert views_deg(scene.capture, surface, maps) < 1.5
+    seen = seen_by(scene.capture, surface)
+    assert views_deg(scene.capture, surface, maps, seen) < 1.5
     about = [Rotation.from_rotvec(np.radians(12) * view.camera.rotation[2]).as_matrix() for view in scene.capture.views]
     turned = [(m @ R.T).astype(np.float32) for m, R in zip(maps, about, strict=True)]
-    assert views_deg(scene.capture, surface, turned) > 5
-    assert views_deg(Capture("one", scene.capture.views[:1]), surface, maps[:1]) == 0
+    assert views_deg(scene.capture, surface, turned, seen) > 5
+    assert views_deg(Capture("one", scene.capture.views[:1]), surface, maps[:1], seen[:1]) == 0
 
 
 def test_expected_error_is_the_stated_one(scene: SphereScene) -> None:
@@ -61,6 +63,22 @@ def test_expected_error_is_the_stated_one(scene: SphereScene) -> None:
     stated = replace(material, confidence=np.full(len(material.albedo), 1 / (1 + (sigma / RELIABLE) ** 2)))
     assert expected_deg(stated) == pytest.approx(4.0 * np.sqrt(np.pi / 2), rel=1e-6)
     assert expected_deg(replace(material, confidence=np.zeros(len(material.albedo)))) == 90
+
+
+def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_distance(scene: SphereScene) -> None:
+    surface, count = scene.reconstruction.surface, len(scene.reconstruction.surface.vertices)
+    sigma = np.radians(2.0)
+    material = replace(scene.reconstruction.material, confidence=np.full(count, 1 / (1 + (sigma / RELIABLE) ** 2)))
+    left, right = (np.flatnonzero(side * surface.vertices[:, 0] > 0) for side in (-1, 1))
+    few = right[np.argsort(surface.vertices[right, 0])[:10]]
+    # A second view sees ten vertices: the distance to the nearest of them decides.
+    seen, two = [np.arange(count), few], Capture("two", scene.capture.views[:2])
+    pixel = pixel_footprint([view.camera for view in two.views], surface.vertices.mean(0))
+    away = np.linalg.norm(surface.vertices[:, None] - surface.vertices[few], axis=2).min(1) / pixel
+    assert depth_px(two, surface, material, seen) == pytest.approx(np.sqrt(np.pi / 2) * sigma * away.mean(), rel=1e-6)
+    assert depth_px(two, surface, material, [np.arange(count)] * 2) == 0
+    assert depth_px(two, surface, material, [left, right]) == 0
+    assert depth_px(two, surface, replace(material, confidence=np.zeros(count)), seen) == 0
 
 
 def test_noise_is_no_misfit(scene: SphereScene) -> None:
@@ -82,6 +100,7 @@ def test_what_could_not_be_mended_is_a_doubt() -> None:
         ({"outline_px": 1.5}, "doubtful", "1.5 px apart"),
         ({"views_deg": 8.0}, "doubtful", "8 deg apart"),
         ({"expected_deg": 12.0}, "doubtful", "12 deg off"),
+        ({"depth_px": 3.0}, "doubtful", "may be 3 px off"),
         ({"views_deg": 8.0, "expected_deg": 12.0}, "doubtful", "same place are 8 deg"),
     ],
 )

@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvps.camera import project
-from mvps.checks.outlines import Outlines, by_other_half, fallen, fitted, misfit, outlines_of, positive, tie_of
+from mvps.checks.outlines import MASK_NOISE, Outlines, by_other_half, fallen, fitted, misfit, outlines_of, positive, tie_of
 from mvps.checks.photographed import by_photographs
 from mvps.finding import Finding
 from mvps.material import CERTAIN
@@ -23,6 +23,10 @@ from mvps.scene import Capture, Float
 
 FRAME_PIXELS = 1.0
 """Median motion of the cameras from which the frame of the world is in doubt, and with it distances to anything else in that frame."""
+
+DOUBTFUL_PIXELS = 2 * MASK_NOISE
+"""Mean of the positive misses from which what cameras do not mend is in doubt: a miss has the noise of two views' masks, and is the largest
+of several."""
 
 LEAST_VIEWS = 3
 """Two views share the lines of sight through two outline points alone."""
@@ -41,6 +45,8 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
     seen = f"lines of sight along the outlines miss what the other views leave of the object by {misfit(before):.2f} px in the mean"
     motions = by_silhouettes(outlines, still)
     if motions is None:
+        if misfit(before) <= DOUBTFUL_PIXELS:
+            return capture, []
         text = f"{seen}, and moving the cameras does not mend it: masks or calibration are wrong in another way; check both"
         return capture, [Finding("pose", "all views", text, False)]
     mended, factors = by_photographs(with_motions(capture, outlines.body, motions), outlines.body)
