@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.camera import pixel_footprint, project
+from mvps.camera import pixel_footprint, project, view_directions
 from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.material import POOR_FIT
-from mvps.mesh import normalise
+from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Capture, Float, Int, Material, Surface, View, expected_error_deg
 from mvps.silhouette import mask_distances, sampled
 from mvps.visibility import RayCaster, camera_hits, ray_caster, visible_vertices
@@ -34,9 +34,12 @@ BAD_DEG = 10.0
 CONTRADICTION_DEG = BAD_DEG / np.sqrt(2)
 """Standard deviation between views above which they contradict each other: with as large an error that they share the sum is BAD_DEG."""
 
-DEPTH_PIXELS = 2.0
-"""Of depth_px, which supposes errors of one sign: made objects in three to five views were 0.4 to 1.0 of it off, and off by a pixel in the
-mean they are of no use as a measurement."""
+DEPTH_PIXELS = 1.0
+"""Of depth_px: surfaces of made objects in three or four views were 0.8 to 1.5 of it off, and off by a pixel in the mean they are of no use
+as a measurement."""
+
+LEAST_FACING = 0.2
+"""Cosine of the angle between normal and view from which a view tells where the surface is: across it a pixel is five times as long."""
 
 OUTLINE_PIXELS = 1.0
 """Mean error of outlines that masks of whole pixels cannot explain."""
@@ -100,8 +103,11 @@ def seen_by(capture: Capture, surface: Surface) -> list[Int]:
 
 
 def depth_px(capture: Capture, surface: Surface, material: Material, seen: Sequence[Int]) -> float:
-    """`depth_px` above, of vertices that each view sees; 0 where no two see the same, as of a single view."""
-    views = np.bincount(np.concatenate(seen), minlength=len(surface.vertices))
+    """`depth_px` above, where views see the vertices `seen`; 0 where no two see the same, as of a single view."""
+    normal, views = vertex_normals(surface), np.zeros(len(surface.vertices), np.int64)
+    for view, index in zip(capture.views, seen, strict=True):
+        facing = (normal[index] * view_directions(view.camera, surface.vertices[index])).sum(1)
+        views[index[facing > LEAST_FACING]] += 1
     alone, several = np.flatnonzero((views == 1) & (material.confidence > 0)), views > 1
     if not len(alone) or not several.any():
         return 0.0
@@ -167,8 +173,8 @@ def verdict(found: Mapping[str, float], settled: tuple[str, str], findings: Sequ
         doubts.append(f"normals are expected to be {found['expected_deg']:.0f} deg off in the mean")
     if found["depth_px"] > DEPTH_PIXELS:
         doubts.append(
-            f"the depth of what one view alone sees may be {found['depth_px']:.0f} px off in the mean over the surface"
-            f" (good ones under {DEPTH_PIXELS:.0f})"
+            f"the depth of what one view alone sees is likely to be {found['depth_px']:.1f} px off in the mean over the"
+            f" surface (good ones under {DEPTH_PIXELS:g})"
         )
     if doubts:
         return "doubtful", (

@@ -9,10 +9,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from sphere_scene import SphereScene, make_sphere
 
-from mvps.camera import pixel_footprint
+from mvps.camera import pixel_footprint, view_directions
 from mvps.finding import Finding
+from mvps.mesh import vertex_normals
 from mvps.scene import RELIABLE, Capture, Surface
-from mvps.verdict import depth_px, expected_deg, noise_share, outline_px, seen_by, signs, verdict, views_deg
+from mvps.verdict import LEAST_FACING, depth_px, expected_deg, noise_share, outline_px, seen_by, signs, verdict, views_deg
 
 SETTLED = ("converged", "settled.")
 GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0, "depth_px": 0.1}
@@ -69,16 +70,22 @@ def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_di
     surface, count = scene.reconstruction.surface, len(scene.reconstruction.surface.vertices)
     sigma = np.radians(2.0)
     material = replace(scene.reconstruction.material, confidence=np.full(count, 1 / (1 + (sigma / RELIABLE) ** 2)))
-    left, right = (np.flatnonzero(side * surface.vertices[:, 0] > 0) for side in (-1, 1))
-    few = right[np.argsort(surface.vertices[right, 0])[:10]]
-    # A second view sees ten vertices: the distance to the nearest of them decides.
-    seen, two = [np.arange(count), few], Capture("two", scene.capture.views[:2])
+    outward = vertex_normals(surface)
+    faces = [(outward * view_directions(view.camera, surface.vertices)).sum(1) > LEAST_FACING for view in scene.capture.views]
+    other = max(range(1, len(faces)), key=lambda k: int((faces[0] & faces[k]).sum()))
+    two = Capture("two", (scene.capture.views[0], scene.capture.views[other]))
+    first, second = np.flatnonzero(faces[0]), np.flatnonzero(faces[other])
+    # Of all that the first view sees the second sees ten vertices: the distance to the nearest of them decides.
+    both = np.intersect1d(first, second)[:10]
     pixel = pixel_footprint([view.camera for view in two.views], surface.vertices.mean(0))
-    away = np.linalg.norm(surface.vertices[:, None] - surface.vertices[few], axis=2).min(1) / pixel
-    assert depth_px(two, surface, material, seen) == pytest.approx(np.sqrt(np.pi / 2) * sigma * away.mean(), rel=1e-6)
-    assert depth_px(two, surface, material, [np.arange(count)] * 2) == 0
-    assert depth_px(two, surface, material, [left, right]) == 0
-    assert depth_px(two, surface, replace(material, confidence=np.zeros(count)), seen) == 0
+    away = np.linalg.norm(surface.vertices[first][:, None] - surface.vertices[both], axis=2).min(1) / pixel
+    assert depth_px(two, surface, material, [first, both]) == pytest.approx(np.sqrt(np.pi / 2) * sigma * away.mean(), rel=1e-6)
+    assert depth_px(two, surface, material, [both, both]) == 0
+    assert depth_px(two, surface, material, [np.setdiff1d(first, both), both]) == 0
+    assert depth_px(two, surface, replace(material, confidence=np.zeros(count)), [first, both]) == 0
+    # What a view sees from the side is not seen twice.
+    aside = np.setdiff1d(first, second)[:10]
+    assert depth_px(two, surface, material, [first, aside]) == 0
 
 
 def test_noise_is_no_misfit(scene: SphereScene) -> None:
@@ -100,7 +107,7 @@ def test_what_could_not_be_mended_is_a_doubt() -> None:
         ({"outline_px": 1.5}, "doubtful", "1.5 px apart"),
         ({"views_deg": 8.0}, "doubtful", "8 deg apart"),
         ({"expected_deg": 12.0}, "doubtful", "12 deg off"),
-        ({"depth_px": 3.0}, "doubtful", "may be 3 px off"),
+        ({"depth_px": 3.0}, "doubtful", "likely to be 3.0 px off"),
         ({"views_deg": 8.0, "expected_deg": 12.0}, "doubtful", "same place are 8 deg"),
     ],
 )

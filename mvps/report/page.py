@@ -158,7 +158,7 @@ def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
 
 SIGNS = {
     "expected_deg": ("normals: expected error, mean", 1.0, "deg"),
-    "depth_px": ("depth of what one view alone sees: mean error to expect at most", 1.0, "px"),
+    "depth_px": ("depth of what one view alone sees: expected error, mean over the surface", 1.0, "px"),
     "views_deg": ("normals of different views at the same place: standard deviation", 1.0, "deg"),
     "outline_px": ("outlines against the masks: distance, mean", 1.0, "pixels"),
     "misfit": ("photographs against the model, without noise: share of the signal", 100.0, "%"),
