@@ -18,6 +18,8 @@ from typing import Any, BinaryIO, TypeVar
 import numpy as np
 import torch
 
+import mvps
+import solvers
 from mvps.inputs import DAMAGED, JSON_LIMIT, check_npz, read_file
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError, Lights
@@ -62,6 +64,17 @@ def unpacked(text: Any, arrays: Mapping[str, Any], kinds: Mapping[str, Callable[
     return named if kind == "dict" else kinds[kind](**named)
 
 
+def program() -> str:
+    """Hash of the program's own source: what another version kept may be of other kinds, or of other sizes."""
+    digest = hashlib.blake2b(digest_size=16)
+    for package in (mvps, solvers):
+        folder = Path(package.__path__[0])
+        for path in sorted(folder.rglob("*.py")):
+            digest.update(str(path.relative_to(folder)).encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
 def fingerprint(capture: Capture, lights: Lights | None) -> str:
     """Hash of all that a reconstruction reads of a capture, with its calibrated lights if they are used."""
     digest = hashlib.blake2b(digest_size=16)
@@ -93,8 +106,8 @@ class Checkpoints:
             shutil.rmtree(folder)
         elif read_file(folder / RUN, JSON_LIMIT) != self._run.encode():
             raise CaptureError(
-                f"{folder}: wanted the checkpoints of a run with these options on this capture, given those of another; see {RUN}"
-                " there, or start anew without --resume"
+                f"{folder}: wanted the checkpoints of a run with these options, this capture and this program, given those of another;"
+                f" see {RUN} there, or start anew without --resume"
             )
 
     def step(self, name: str, make: Callable[[], T], progress: Progress) -> T:

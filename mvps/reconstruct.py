@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
@@ -201,13 +202,14 @@ class Begun(NamedTuple):
     law: Law
 
 
-def begin(capture: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress) -> Begun:
-    """What photographs and masks say before anything is solved together."""
+def begin(capture: Capture, masks: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress) -> Begun:
+    """What photographs and masks say before anything is solved together. masks: the same views, perhaps larger: thin parts are in no other
+    way known to the hull."""
     from mvps.device import chosen_device
     from mvps.joint.thinned import thinned
     from mvps.photometric import normal_maps
 
-    grid, surface = rough_shape(capture, progress)
+    grid, surface = rough_shape(masks, progress)
     start = first_lights(capture, surface, lights, settings.seed, progress, parts.one_rig)
     with progress.stage("photometric stereo"):
         maps = normal_maps(*thinned(capture, start), chosen_device(settings.device))
@@ -218,7 +220,7 @@ def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Par
     """Stage II on the hull alone."""
     from mvps.plan import first_pass
 
-    begun, plan = begin(used, settings, lights, parts, progress), parts.of(first_pass(lights is None, True))
+    begun, plan = begin(used, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, True))
     refined: Refined = step("joint refinement", lambda: stage_two("joint refinement", used, begun.surface, begun, plan, settings, progress))
     return refined
 
@@ -226,14 +228,42 @@ def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Par
 def coarse(
     used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step
 ) -> tuple[Refined, list[dict[str, float]]]:
-    """Shape, lights and normals for the last rounds to start from, and the rounds that they took."""
+    """Shape, lights and normals for the last rounds to start from, and the rounds that they took, moves in pixels of `used`. Of large
+    photographs at half their size, or less; what is found there is pulled to what each larger level but the last shows."""
     from mvps.plan import carving_pass, first_pass
 
-    begun, plan = begin(used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
-    rough = step("first refinement", lambda: stage_two("first refinement", used, begun.surface, begun, plan, settings, progress))
+    sizes = half_sizes(used, progress)
+    level = sizes.pop()
+    begun, plan = begin(level, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
+    rough = step("first refinement", lambda: stage_two("first refinement", level, begun.surface, begun, plan, settings, progress))
     turns = parts.of(carving_pass(lights is None))
-    found: tuple[Refined, list[dict[str, float]]] = step("shape", lambda: shaped(used, begun.grid, rough, settings, turns, progress))
-    return found
+    found: Refined
+    found, rounds = step("shape", lambda: shaped(level, begun.grid, rough, settings, turns, progress))
+    rounds = in_pixels(rounds, 2 ** len(sizes))
+    while len(sizes) > 1:
+        level, before = sizes.pop(), replace(found, maps=())
+        name = f"refinement at {level.views[0].camera.width} x {level.views[0].camera.height}"
+        found = step(name, partial(stage_two, name, level, before.surface, before, turns, settings, progress, before.carried))
+        rounds = rounds + in_pixels(found.rounds, 2 ** len(sizes))
+    return found, rounds
+
+
+def half_sizes(capture: Capture, progress: Progress) -> list[Capture]:
+    """`levels` of the capture, under the progress bar where there is more than one."""
+    from mvps.pyramid import halvings, levels
+
+    if not halvings(capture):
+        return [capture]
+    with progress.stage("half size") as stage:
+        sizes = levels(capture)
+        least = sizes[-1].views[0].camera
+        stage.status(f"the shape is looked for at {least.width} x {least.height} pixels")
+    return sizes
+
+
+def in_pixels(rounds: list[dict[str, float]], factor: int) -> list[dict[str, float]]:
+    """Rounds on a level whose pixels are `factor` of the photographs' wide, with moves in the photographs'."""
+    return [{key: value * factor if key.endswith("_px") else value for key, value in one.items()} for one in rounds]
 
 
 def reconstruct(
@@ -251,7 +281,7 @@ def reconstruct(
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
     from mvps.plan import Parts, last_pass
-    from mvps.pyramid import for_shape
+    from mvps.pyramid import halvings
 
     parts = parts or Parts()
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
@@ -267,12 +297,11 @@ def reconstruct(
     if settings.preset == "draft":
         refined = drafted(used, settings, lights, parts, progress, step)
     else:
-        level = for_shape(used)
-        far = few_lights(used) or level is not used
-        start, rounds = coarse(level, settings, lights, parts, progress, step)
-        del level
+        start, rounds = coarse(used, settings, lights, parts, progress, step)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
         free = lights is None and start.rounds[-1]["residual"] <= POOR_FIT
+        far = few_lights(used) or halvings(used) > 0
+        start = replace(start, maps=()) if halvings(used) else start
         plan, name = parts.of(last_pass(settings.preset, free, far)), "joint refinement"
         refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
     with progress.stage("lights and normals of all views"):
@@ -307,7 +336,7 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
 
 def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Lights | None, resume: bool) -> Checkpoints:
     """Those of this run in its result's place."""
-    from mvps.checkpoint import Checkpoints, fingerprint
+    from mvps.checkpoint import Checkpoints, fingerprint, program
     from mvps.device import chosen_device
     from mvps.folders import CHECKPOINT
     from mvps.joint.blocks import Vertices
@@ -315,7 +344,7 @@ def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Ligh
     from mvps.material import Trial
     from mvps.scene import Law, Material, Residual, Surface
 
-    run = {"settings": asdict(settings), "versions": versions(), "capture": fingerprint(capture, lights)}
+    run = {"settings": asdict(settings), "versions": versions(), "program": program(), "capture": fingerprint(capture, lights)}
     kinds = (Refined, Surface, Material, Residual, Lights, NormalMap, Law, Trial, Vertices)
     return Checkpoints(out / CHECKPOINT, run, kinds, chosen_device(settings.device), resume)
 

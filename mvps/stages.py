@@ -2,7 +2,7 @@
 
 The visual hull; Stage I; and Stage I's ablations (Yang et al. 2022, "effectiveness of normal regularization"): radiance fields of density
 (NeRF) or occupancy (UNISURF), with and without the normals' loss. All fields have the same masks, start at the hull, rays, samples and
-steps; rendering and losses differ (radiance.py).
+steps, and see large photographs at half their size; rendering and losses differ (radiance.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mvps.outcome import all_lights, versions
 from mvps.photometric import normal_maps
 from mvps.plan import Parts, first_pass
 from mvps.progress import Progress
-from mvps.pyramid import for_shape
+from mvps.pyramid import levels
 from mvps.radiance import RadianceSettings, radiance_surface
 from mvps.reconstruct import Settings, begin, first_lights, parted, rough_shape, stage_one, stage_two
 from mvps.scene import Capture, Lights, Reconstruction, Surface
@@ -37,8 +37,8 @@ def hull(capture: Capture, settings: Settings, given: Lights | None, progress: P
 
 def stage1(capture: Capture, settings: Settings, given: Lights | None, progress: Progress) -> Reconstruction:
     """What Stage I makes of the normals and lights that Stage II found on the hull."""
-    used = for_shape(parted(capture, settings.hold_out_views, settings.hold_out_lights)[0])
-    begun, plan = begin(used, settings, given, Parts(), progress), first_pass(given is None, False)
+    used = levels(parted(capture, settings.hold_out_views, settings.hold_out_lights)[0])[-1]
+    begun, plan = begin(used, used, settings, given, Parts(), progress), first_pass(given is None, False)
     rough = stage_two("first refinement", used, begun.surface, begun, plan, settings, progress)
     field = Occupancy(used, begun.grid, OccupancySettings(), settings.seed, chosen_device(settings.device))
     surface = stage_one(field, rough.maps, OccupancySettings(), progress)
@@ -50,7 +50,7 @@ def radiance(
 ) -> Reconstruction:
     """The surface of a radiance field, a density or an occupancy, trained with or without the views' photometric stereo."""
     device, plan, maps = chosen_device(settings.device), RadianceSettings(), None
-    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    used = levels(parted(capture, settings.hold_out_views, settings.hold_out_lights)[0])[-1]
     grid, rough = rough_shape(used, progress)
     lights = first_lights(used, rough, given, settings.seed, progress)
     if with_normals:

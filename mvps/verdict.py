@@ -4,8 +4,8 @@ misfit        of the image model, as a share of the images' signal, without the 
 outline_px    area between the mesh's silhouettes and the masks over the masks' outlines: by how far outlines are off, in the mean
 views_deg     median over the vertices of the standard deviation of different views' normals at the same vertex
 expected_deg  mean of the vertices' expected errors: sqrt(pi / 2) times the stated standard deviation along a tangent (stated.py)
-depth_px      mean over the vertices of e L: what one view alone sees has its depth from normals, and with an error of e (expected, radians)
-              all over the distance of L pixels from the nearest vertex that a second view sees, it is e L off; 0 where two views see
+depth_px      mean over the seen vertices of e L: what one view alone sees has its depth from normals, and with an error of e (expected,
+              radians) all over the distance of L pixels from the nearest vertex that a second view sees, it is e L off; 0 where two see
 
 Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
 sigma = median |I(x - 1) - 2 I(x) + I(x + 1)| / (0.6745 sqrt(6)); vertices interpolate between four pixels, which leaves two thirds of it.
@@ -23,7 +23,7 @@ from mvps.camera import pixel_footprint, project, view_directions
 from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.material import POOR_FIT
-from mvps.mesh import normalise, vertex_normals
+from mvps.mesh import lengths, normalise, vertex_normals
 from mvps.scene import Capture, Float, Int, Material, Surface, View, expected_error_deg
 from mvps.silhouette import mask_distances, sampled
 from mvps.visibility import RayCaster, camera_hits, ray_caster, visible_vertices
@@ -103,18 +103,23 @@ def seen_by(capture: Capture, surface: Surface) -> list[Int]:
 
 
 def depth_px(capture: Capture, surface: Surface, material: Material, seen: Sequence[Int]) -> float:
-    """`depth_px` above, where views see the vertices `seen`; 0 where no two see the same, as of a single view."""
+    """`depth_px` above, where views see the vertices `seen`. Where none is seen twice, L is the object's radius;
+    0 for a single view, which has no depth at all."""
+    if len(capture.views) == 1:
+        return 0.0
     normal, views = vertex_normals(surface), np.zeros(len(surface.vertices), np.int64)
     for view, index in zip(capture.views, seen, strict=True):
         facing = (normal[index] * view_directions(view.camera, surface.vertices[index])).sum(1)
         views[index[facing > LEAST_FACING]] += 1
-    alone, several = np.flatnonzero((views == 1) & (material.confidence > 0)), views > 1
-    if not len(alone) or not several.any():
+    alone, several = surface.vertices[views == 1], surface.vertices[views > 1]
+    if not len(alone):
         return 0.0
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
-    away = neighbours(cKDTree(surface.vertices[several]), surface.vertices[alone])[0] / pixel
-    error = np.radians(np.minimum(expected_error_deg(material.confidence[alone]), 90))
-    return float((error * away).sum() / (views > 0).sum())
+    radius = lengths(surface.vertices - surface.vertices.mean(0)).mean()
+    away = neighbours(cKDTree(several), alone)[0] if len(several) else np.full(len(alone), radius)
+    # Confidence 0 knows nothing: the error's limit.
+    error = np.radians(np.minimum(expected_error_deg(np.maximum(material.confidence[views == 1], 1e-12)), 90))
+    return float((error * away).sum() / pixel / (views > 0).sum())
 
 
 def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.float32]], seen: Sequence[Int]) -> float:

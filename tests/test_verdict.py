@@ -81,11 +81,14 @@ def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_di
     away = np.linalg.norm(surface.vertices[first][:, None] - surface.vertices[both], axis=2).min(1) / pixel
     assert depth_px(two, surface, material, [first, both]) == pytest.approx(np.sqrt(np.pi / 2) * sigma * away.mean(), rel=1e-6)
     assert depth_px(two, surface, material, [both, both]) == 0
-    assert depth_px(two, surface, material, [np.setdiff1d(first, both), both]) == 0
-    assert depth_px(two, surface, replace(material, confidence=np.zeros(count)), [first, both]) == 0
-    # What a view sees from the side is not seen twice.
+    unknown = replace(material, confidence=np.zeros(count))
+    assert depth_px(two, surface, unknown, [first, both]) == pytest.approx(np.pi / 2 * away.mean(), rel=1e-6)
+    # What a view sees from the side is not seen twice, and then nothing is: all is as far off as the object is large.
     aside = np.setdiff1d(first, second)[:10]
-    assert depth_px(two, surface, material, [first, aside]) == 0
+    radius = np.linalg.norm(surface.vertices - surface.vertices.mean(0), axis=1).mean() / pixel
+    assert depth_px(two, surface, material, [first, aside]) == pytest.approx(np.sqrt(np.pi / 2) * sigma * radius, rel=1e-6)
+    one = Capture("one", two.views[:1])
+    assert depth_px(one, surface, material, [first]) == 0
 
 
 def test_noise_is_no_misfit(scene: SphereScene) -> None:
