@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvps.checkpoint import Checkpoints
+from mvps.checkpoint import Checkpoints, program
 from mvps.command import run
 from mvps.progress import Progress
 from mvps.reconstruct import main
@@ -48,6 +48,17 @@ def test_another_run_a_damaged_file_and_no_resume(tmp_path: Path) -> None:
     with pytest.raises(CaptureError, match="given a damaged one"):
         kept(tmp_path / "c").step("a", lambda: 2, Progress())
     assert kept(tmp_path / "c", resume=False).step("a", lambda: 3, Progress()) == 3
+
+
+def test_another_version_of_the_program_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "one.py").write_text(f"x = '{name}'\n")
+    monkeypatch.setattr("mvps.checkpoint.solvers.__path__", [str(tmp_path / "a")])
+    first = program()
+    assert program() == first
+    monkeypatch.setattr("mvps.checkpoint.solvers.__path__", [str(tmp_path / "b")])
+    assert program() != first
 
 
 def test_nothing_in_a_checkpoint_is_executed(tmp_path: Path) -> None:

@@ -53,5 +53,11 @@ def test_parts_change_nothing_else() -> None:
     assert [one.edge for one in coarse.rounds] == [2 * one.edge for one in plan.rounds] and coarse.model == LARGEST
 
 
+def test_a_surface_that_is_far_off_is_pulled_by_photographs_first() -> None:
+    for preset in ("standard", "fine"):
+        near, far = (last_pass(preset, True, far).rounds for far in (False, True))
+        assert far[1:] == near and far[0].carving and far[0].reach > near[0].reach and np.isfinite(far[0].still)
+
+
 def test_budgets_are_methods() -> None:
     assert set(BUDGETS) <= set(METHODS)
