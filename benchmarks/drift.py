@@ -15,12 +15,13 @@ from pathlib import Path
 import numpy as np
 
 from mvps import measures
+from mvps.coarse import coarse
 from mvps.device import chosen_device
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.load import read_capture, read_truth
 from mvps.plan import Parts
 from mvps.progress import Progress
-from mvps.reconstruct import Settings, coarse
+from mvps.reconstruct import Settings
 from mvps.scene import Capture, Lights, NormalMap, Truth
 
 HERE = Path(__file__).resolve().parent

@@ -9,12 +9,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from threading import Thread
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+from mvps.coarse import Step, begin, coarse, stage_two
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
 from mvps.finding import Finding
 from mvps.inputs import shown
@@ -25,35 +25,17 @@ from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruc
 
 if TYPE_CHECKING:
     from mvps.checkpoint import Checkpoints
-    from mvps.joint.refine import Refined, RefineSettings
-    from mvps.occupancy import Occupancy, OccupancySettings
+    from mvps.joint.refine import Refined
     from mvps.plan import Parts
-    from mvps.scene import SignedDistanceGrid, Surface
 
 PRESETS = ("draft", "standard", "fine")
 
 Numbers = Sequence[int]
 LightNumbers = Numbers | Mapping[str, Numbers]
 
-Step = Callable[[str, Callable[[], Any]], Any]
-"""Makes what a long stage makes, under its name; or takes it from where it was kept."""
-
 TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
-
-GOOD_HULL = 0.2
-"""Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
-captures, docs/method.md), so it would do no better."""
-
-MOVING_DEG = 1.0
-"""Mean turn of the lights in a round from which on the field has seen other lights than there are: wrong by a degree, they bend normals by
-as much. Where the model fits, lights of eight captures turned by 0.06 to 0.9 deg, and by 3.8 where four views leave the hull four pixels
-off (docs/method.md)."""
-
-MOST_TURNS = 6
-"""Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
-long as the residual falls."""
 
 
 @dataclass(frozen=True)
@@ -101,121 +83,6 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     return used, capture.select(rest) if rest else None
 
 
-def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
-    """The visual hull as a grid and as a surface."""
-    from mvps.hull import default_cells, signed_distance, visual_hull
-
-    with progress.stage("visual hull") as stage:
-        grid = signed_distance(capture, default_cells(capture))
-        surface = visual_hull(grid)
-        stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing:.3g} units")
-    return grid, surface
-
-
-def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed: int, progress: Progress, may_share: bool = True) -> Lights:
-    """The given lights, or those of the uncalibrated factorisation; may_share: of one rig, if that fits."""
-    from mvps.calibrate import uncalibrated_lights
-
-    with progress.stage("lights") as stage:
-        if given is not None:
-            stage.status("given with the capture")
-            return given
-        calibration = uncalibrated_lights(capture, surface, seed, may_share)
-        stage.status(calibration.words())
-        return calibration.lights
-
-
-def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySettings, progress: Progress, words: str = "") -> Surface:
-    """The occupancy field under the progress bar; words: its status."""
-    with progress.stage("occupancy field", total=plan.steps) as stage:
-        stage.status(words)
-        return field.trained(maps, plan, lambda _, loss: stage.advance(1, loss=loss))
-
-
-def shaped(
-    capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
-) -> tuple[Refined, list[dict[str, float]]]:
-    """Stage I and a coarse round of Stage II on its surface in turn; what Stage II last made, and all its rounds.
-
-    The field digs hollows by normals, the round goes on by photographs, and in a deeper hollow normals and lights are better: the field
-    is trained again from these while the model fits badly or lights turn, as long as the residual falls. A hull that is good enough stays.
-    """
-    from mvps.device import chosen_device
-    from mvps.joint.pixels import few_lights
-    from mvps.material import POOR_FIT
-    from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
-
-    rounds, shift = list(rough.rounds), rough.rounds[0]["vertex_change_px"]
-    words = f"views moved the hull by {shift:.2f} px"
-    # Of fewer lights a view's normals say nothing of their own, and nothing asks the hull to move.
-    if shift < GOOD_HULL and not few_lights(capture):
-        with progress.stage("occupancy field") as stage:
-            stage.status(f"skipped: {words}, less than {GOOD_HULL} px")
-        return rough, rounds
-    plan, refined, carried = OccupancySettings(), rough, None
-    field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device))
-    surface = stage_one(field, rough.maps, plan, progress, words)
-    for turn in range(MOST_TURNS):
-        if turn:
-            surface = stage_one(field, refined.maps, CONTINUED, progress)
-        refined = stage_two("coarse refinement", capture, surface, refined, of_turn, settings, progress, carried)
-        residuals = [one["residual"] for one in rounds + refined.rounds if "residual" in one]
-        rounds, carried = rounds + refined.rounds, refined.carried
-        fits = residuals[-1] <= POOR_FIT and refined.rounds[-1]["light_change_deg"] <= MOVING_DEG
-        if fits or residuals[-1] >= residuals[-2]:
-            break
-    return refined, rounds
-
-
-def stage_two(
-    name: str,
-    capture: Capture,
-    surface: Surface,
-    of: Begun | Refined,
-    plan: RefineSettings,
-    settings: Settings,
-    progress: Progress,
-    carried: tuple[Surface, Any] | None = None,
-) -> Refined:
-    """Rounds of Stage II under the progress bar, from a surface and the lights, normal maps and image model `of` what came before."""
-    from mvps.device import chosen_device
-    from mvps.joint.refine import refine
-
-    with progress.stage(name, total=len(plan.rounds)) as stage:
-
-        def on_round(_: int, changes: dict[str, float]) -> None:
-            stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
-
-        device = chosen_device(settings.device)
-        refined = refine(capture, surface, of.lights, of.maps, of.law, plan, settings.seed, device, on_round, carried)
-        stage.status(refined.status)
-    return refined
-
-
-class Begun(NamedTuple):
-    """What Stage II starts with: the hull, as a grid too, lights, and the views' photometric stereo under them."""
-
-    grid: SignedDistanceGrid
-    surface: Surface
-    lights: Lights
-    maps: tuple[NormalMap, ...]
-    law: Law
-
-
-def begin(capture: Capture, masks: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress) -> Begun:
-    """What photographs and masks say before anything is solved together. masks: the same views, perhaps larger: thin parts are in no other
-    way known to the hull."""
-    from mvps.device import chosen_device
-    from mvps.joint.thinned import thinned
-    from mvps.photometric import normal_maps
-
-    grid, surface = rough_shape(masks, progress)
-    start = first_lights(capture, surface, lights, settings.seed, progress, parts.one_rig)
-    with progress.stage("photometric stereo"):
-        maps = normal_maps(*thinned(capture, start), chosen_device(settings.device))
-    return Begun(grid, surface, start, maps, parts.law())
-
-
 def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step) -> Refined:
     """Stage II on the hull alone."""
     from mvps.plan import first_pass
@@ -223,47 +90,6 @@ def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Par
     begun, plan = begin(used, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, True))
     refined: Refined = step("joint refinement", lambda: stage_two("joint refinement", used, begun.surface, begun, plan, settings, progress))
     return refined
-
-
-def coarse(
-    used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step
-) -> tuple[Refined, list[dict[str, float]]]:
-    """Shape, lights and normals for the last rounds to start from, and the rounds that they took, moves in pixels of `used`. Of large
-    photographs at half their size, or less; what is found there is pulled to what each larger level but the last shows."""
-    from mvps.plan import carving_pass, first_pass
-
-    sizes = half_sizes(used, progress)
-    level = sizes.pop()
-    begun, plan = begin(level, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
-    rough = step("first refinement", lambda: stage_two("first refinement", level, begun.surface, begun, plan, settings, progress))
-    turns = parts.of(carving_pass(lights is None))
-    found: Refined
-    found, rounds = step("shape", lambda: shaped(level, begun.grid, rough, settings, turns, progress))
-    rounds = in_pixels(rounds, 2 ** len(sizes))
-    while len(sizes) > 1:
-        level, before = sizes.pop(), replace(found, maps=())
-        name = f"refinement at {level.views[0].camera.width} x {level.views[0].camera.height}"
-        found = step(name, partial(stage_two, name, level, before.surface, before, turns, settings, progress, before.carried))
-        rounds = rounds + in_pixels(found.rounds, 2 ** len(sizes))
-    return found, rounds
-
-
-def half_sizes(capture: Capture, progress: Progress) -> list[Capture]:
-    """`levels` of the capture, under the progress bar where there is more than one."""
-    from mvps.pyramid import halvings, levels
-
-    if not halvings(capture):
-        return [capture]
-    with progress.stage("half size") as stage:
-        sizes = levels(capture)
-        least = sizes[-1].views[0].camera
-        stage.status(f"the shape is looked for at {least.width} x {least.height} pixels")
-    return sizes
-
-
-def in_pixels(rounds: list[dict[str, float]], factor: int) -> list[dict[str, float]]:
-    """Rounds on a level whose pixels are `factor` of the photographs' wide, with moves in the photographs'."""
-    return [{key: value * factor if key.endswith("_px") else value for key, value in one.items()} for one in rounds]
 
 
 def reconstruct(
@@ -342,7 +168,7 @@ def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Ligh
     from mvps.joint.blocks import Vertices
     from mvps.joint.refine import Refined
     from mvps.material import Trial
-    from mvps.scene import Law, Material, Residual, Surface
+    from mvps.scene import Material, Residual, Surface
 
     run = {"settings": asdict(settings), "versions": versions(), "program": program(), "capture": fingerprint(capture, lights)}
     kinds = (Refined, Surface, Material, Residual, Lights, NormalMap, Law, Trial, Vertices)

@@ -11,6 +11,7 @@ from dataclasses import asdict
 
 import numpy as np
 
+from mvps.coarse import begin, first_lights, rough_shape, stage_one, stage_two
 from mvps.device import chosen_device
 from mvps.joint.lambertian import lambertian
 from mvps.joint.thinned import thinned
@@ -22,7 +23,7 @@ from mvps.plan import Parts, first_pass
 from mvps.progress import Progress
 from mvps.pyramid import levels
 from mvps.radiance import RadianceSettings, radiance_surface
-from mvps.reconstruct import Settings, begin, first_lights, parted, rough_shape, stage_one, stage_two
+from mvps.reconstruct import Settings, parted
 from mvps.scene import Capture, Lights, Reconstruction, Surface
 from mvps.visibility import ray_caster
 

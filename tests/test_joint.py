@@ -228,6 +228,20 @@ def test_what_is_no_number_moves_nothing_and_the_rest_moves() -> None:
     assert np.abs(grown - RADIUS - 1).mean() < 0.1
 
 
+def test_a_face_without_area_takes_no_part() -> None:
+    """Its cotangents are no numbers, and one of them in the system would leave no surface at all."""
+    ball = make_sphere(3).reconstruction.surface
+    edge = ball.faces[0]
+    middle = ball.vertices[edge[:2]].mean(0)
+    with_sliver = Surface(np.vstack([ball.vertices, middle]), np.vstack([ball.faces, [edge[0], edge[1], len(ball.vertices)]]))
+    outward = normalise(with_sliver.vertices)
+    agreed = Agreement(np.full(len(outward), 0.1), np.full(len(outward), 0.01))
+    target = normalise(outward[with_sliver.faces].sum(1))
+    moved = fuse(with_sliver, target, agreed, 0.02)[0].vertices
+    plain = fuse(ball, target[:-1], Agreement(agreed.offset[:-1], agreed.sigma[:-1]), 0.02)[0].vertices
+    assert np.abs(moved[:-1] - plain).max() < 1e-2 and np.isfinite(moved).all()
+
+
 def test_pixels_of_a_fold_show_more_than_one_normal() -> None:
     """In any unit: a sphere of 20 pixels radius bends by a twentieth of a radian in a pixel. What is within half a pixel is not seen."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=20.0)

@@ -14,12 +14,13 @@ from sphere_scene import RADIUS, make_sphere
 
 from mvps import evaluate, reconstruct
 from mvps.camera import pixel_footprint
+from mvps.coarse import MOST_TURNS, in_turn, shaped
 from mvps.command import run
 from mvps.export import read_reconstruction
 from mvps.measures import distance_to
 from mvps.occupancy import CONTINUED, OccupancySettings
 from mvps.progress import Progress
-from mvps.reconstruct import MOST_TURNS, Settings, shaped
+from mvps.reconstruct import Settings
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -149,13 +150,14 @@ def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> 
         surface="hull",
         rounds=[{"residual": 0.01, "light_change_deg": 0.0, "vertex_change_px": 0.0}],
     )
-    monkeypatch.setattr("mvps.reconstruct.stage_one", lambda *_: "field")
+    monkeypatch.setattr("mvps.coarse.stage_one", lambda *_: "field")
     refined = SimpleNamespace(**vars(rough) | {"surface": "refined"})
-    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined)
+    monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    of_turn = SimpleNamespace(rounds=[SimpleNamespace(fusions=0)])
     for lights, surface in ((1, "refined"), (3, "refined"), (4, "hull")):
         capture = SimpleNamespace(views=[SimpleNamespace(lights=tuple(range(lights)))])
-        assert shaped(capture, None, rough, Settings("somewhere"), True, Progress())[0].surface == surface  # type: ignore[arg-type]
+        assert shaped(capture, None, rough, Settings("somewhere"), of_turn, Progress())[0].surface == surface  # type: ignore[arg-type]
 
 
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
@@ -219,9 +221,9 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
     def one(_: object, __: object, plan: OccupancySettings, *___: object) -> None:
         trained.append(plan.steps)
 
-    monkeypatch.setattr("mvps.reconstruct.stage_two", lambda *_: refined(*next(made)))
-    monkeypatch.setattr("mvps.reconstruct.stage_one", one)
+    monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined(*next(made)))
+    monkeypatch.setattr("mvps.coarse.stage_one", one)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    last, rounds = shaped(None, None, refined(0.3, 5.0), Settings("somewhere"), True, None)  # type: ignore[arg-type]
+    last, rounds = in_turn(None, None, refined(0.3, 5.0), Settings("somewhere"), None, None, "")  # type: ignore[arg-type]
     assert trained == [OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
-    assert [r["residual"] for r in rounds] == [0.3, *residuals[:turns]] and last.rounds[0]["residual"] == residuals[turns - 1]
+    assert [r["residual"] for r in rounds] == list(residuals[:turns]) and last.rounds[0]["residual"] == residuals[turns - 1]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mvps.coarse import rough_shape
 from mvps.material import LARGEST, Model
 from mvps.measures import distance_to
 from mvps.methods import BUDGETS, METHODS
 from mvps.plan import Parts, first_pass, last_pass
 from mvps.progress import Progress
-from mvps.reconstruct import Settings, reconstruct, rough_shape
+from mvps.reconstruct import Settings, reconstruct
 from mvps.scene import Capture, Reconstruction
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings

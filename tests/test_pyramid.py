@@ -10,11 +10,12 @@ import pytest
 
 import mvps.pyramid
 from mvps.camera import pixel_footprint, project
+from mvps.coarse import coarse
 from mvps.measures import distance_to
 from mvps.plan import Parts
 from mvps.progress import Progress
 from mvps.pyramid import halved, halvings, levels
-from mvps.reconstruct import Settings, coarse, reconstruct
+from mvps.reconstruct import Settings, reconstruct
 from mvps.scene import Camera, Capture, View
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -126,9 +127,9 @@ def test_of_two_halvings_each_level_is_seen(monkeypatch: pytest.MonkeyPatch) -> 
         seen.append((name, of.views[0].camera.width))
         return SimpleNamespace(surface=None, carried=None, rounds=[{"residual": 0.01, "vertex_change_px": 0.1}])
 
-    monkeypatch.setattr("mvps.reconstruct.stage_two", stage_two)
-    monkeypatch.setattr("mvps.reconstruct.replace", lambda of, **_: of)
-    monkeypatch.setattr("mvps.reconstruct.shaped", lambda *_: (stage_two("shape", _[0]), [{"vertex_change_px": 0.5}]))
+    monkeypatch.setattr("mvps.coarse.stage_two", stage_two)
+    monkeypatch.setattr("mvps.coarse.replace", lambda of, **_: of)
+    monkeypatch.setattr("mvps.coarse.shaped", lambda *_: (stage_two("shape", _[0]), [{"vertex_change_px": 0.5}]))
     _, rounds = coarse(capture, Settings("made"), None, Parts(), Progress(), lambda _, make: make())
     assert seen == [("first refinement", 24), ("shape", 24), ("refinement at 48 x 48", 48)]
     assert [one["vertex_change_px"] for one in rounds] == pytest.approx([4 * 0.5, 2 * 0.1])

@@ -16,7 +16,7 @@ from mvps.scene import RELIABLE, Capture, Surface
 from mvps.verdict import LEAST_FACING, depth_px, expected_deg, noise_share, outline_px, seen_by, signs, verdict, views_deg
 
 SETTLED = ("converged", "settled.")
-GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0, "depth_px": 0.1}
+GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0, "depth_px": 0.1, "hidden_px": 0.1}
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,13 @@ def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_di
 
 def test_noise_is_no_misfit(scene: SphereScene) -> None:
     r = scene.reconstruction
-    found = signs(scene.capture, r.surface, r.material, r.normal_maps, 0.2)
+    everywhere = np.full(len(r.surface.vertices), 0.01)
+    found = signs(scene.capture, r.surface, r.material, r.normal_maps, 0.2, everywhere)
+    assert found["hidden_px"] == 0
+    # A hemisphere that nothing explains hides what it spans.
+    half = np.where(r.surface.vertices[:, 2] > 0, 1.0, everywhere)
+    radius = np.linalg.norm(r.surface.vertices, axis=1).mean() / pixel_footprint([v.camera for v in scene.capture.views], np.zeros(3))
+    assert 0.15 < signs(scene.capture, r.surface, r.material, r.normal_maps, 0.2, half)["hidden_px"] / radius < 0.45
     assert found["misfit"] == pytest.approx(np.sqrt(0.04 - found["noise"] ** 2)) and set(found) == set(GOOD)
 
 
@@ -111,6 +117,7 @@ def test_what_could_not_be_mended_is_a_doubt() -> None:
         ({"views_deg": 8.0}, "doubtful", "8 deg apart"),
         ({"expected_deg": 12.0}, "doubtful", "12 deg off"),
         ({"depth_px": 3.0}, "doubtful", "likely to be 3.0 px off"),
+        ({"hidden_px": 1.5}, "doubtful", "would put the surface 1.5 px off"),
         ({"views_deg": 8.0, "expected_deg": 12.0}, "doubtful", "same place are 8 deg"),
     ],
 )

@@ -115,7 +115,8 @@ class RefineSettings:
 @dataclass(frozen=True, eq=False)
 class Refined:
     """surface, material and lights; maps: per view its pixels' normals; per round what changed; whether the last step was small, in words,
-    and a sentence; carried: the surface with what its vertices were solved to, from which later rounds may go on."""
+    and a sentence; unexplained (V,): what the model leaves of a vertex's samples, root mean squares as a share of the signal, NaN where no
+    view sees it; carried: the surface with what its vertices were solved to, from which later rounds may go on."""
 
     surface: Surface
     material: Material
@@ -126,6 +127,7 @@ class Refined:
     rounds: list[dict[str, float]]
     status: str
     text: str
+    unexplained: Float
     carried: tuple[Surface, Vertices] | None = None
 
 
@@ -248,7 +250,8 @@ def refine(
     if told is None or not settings.detail:
         return result
     finer = detailed(capture, told, state.maps, seen, NORMAL_SIGMA)
-    return replace(result, surface=finer.surface, material=interpolated(result.material, finer))
+    material, unexplained = interpolated(result.material, finer), finer.share @ result.unexplained
+    return replace(result, surface=finer.surface, material=material, unexplained=unexplained)
 
 
 def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Material:
@@ -275,7 +278,8 @@ def finished(state: State, settings: RefineSettings, account: list[dict[str, flo
     assert state.vertices is not None
     material = _coloured(state, settings.model.neural, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
     status, text = _settled(account)
-    return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text)
+    unexplained = relative_residuals(state.views, state.vertices).double().cpu().numpy()
+    return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text, unexplained)
 
 
 def _settled(account: list[dict[str, float]]) -> tuple[str, str]:

@@ -47,6 +47,10 @@ often."""
 ALONG = 0.5
 """Least slope of the distance to a mask along an outline's normal, 1 where they are parallel; below it another part is nearer."""
 
+SLIVER = 1e-6
+"""Of the mean face's area, below which a face takes no part: the cotangents of its angles are as large as all others' together, or no
+numbers. Remeshing leaves one in some hundred thousand."""
+
 
 class Moved(NamedTuple):
     """A surface, and where views and masks agreed that its vertices lie before normals had their say: place (V, 3), sigma (V,) standard
@@ -110,13 +114,17 @@ def fuse(
     normal_sigma radians. The factor of the system may serve another fusion of a surface that has hardly moved.
     """
     x = surface.vertices
-    scale = len(x) / (normal_sigma**2 * face_areas(surface).sum())
-    L = igl.cotmatrix(x, surface.faces) * -scale
+    area = face_areas(surface)
+    scale = len(x) / (normal_sigma**2 * area.sum())
     # Solved together, one that is no number would take all others with it.
     target = np.where(np.isfinite(target).all(1, keepdims=True), target, face_normals(surface))
+    even, whole = surface, area > SLIVER * area.mean()
+    if not whole.all():
+        even, target = Surface(x, surface.faces[whole]), target[whole]
+    L = igl.cotmatrix(x, even.faces) * -scale
     known = np.isfinite(agreed.offset) & np.isfinite(agreed.sigma)
     offset, sigma = np.where(known, agreed.offset, 0), np.where(known, agreed.sigma, np.inf)
-    right = _turned_divergence(surface, target) * scale
+    right = _turned_divergence(even, target) * scale
     outward = vertex_normals(surface)
     agreed_at, weight = x + offset[:, None] * outward, 1 / sigma**2
     # Vertices that no views agree on hold still softly: without them a patch seen by nobody would have no place.

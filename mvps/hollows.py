@@ -1,0 +1,96 @@
+"""Hollows deeper than anything else reaches, found by what the image model cannot explain and dug out of the solid.
+
+Pixels over a deep hollow show, at each place of the surface that bridges it, something else in every view. Nothing fits there, so normals
+say nothing and no neighbouring place fits better: the surface stays. But where it is wrong is known, by the share u of a vertex's samples
+that the model leaves unexplained, beyond their noise. With U the vertices above MISFIT and
+
+    L(v) = distance from v in U to the nearest vertex that fits, 0 elsewhere
+
+a hollow under a patch of U is likely to be about as deep as the patch is wide. So balls of radius min(L, half of the solid's thickness
+inwards) around U are cut out of it, a pit that ends at the patch's edge and never meets another side. Of what is then seen the model
+explains more if the hollow is there: the caller sees to that, and digs again (space carving, Kutulakos and Seitz 2000, by patches and with
+a way back). The mean of L over what is seen,
+
+    hidden_px = mean of L, pixels,
+
+says how far off the surface is likely to be for this alone.
+"""
+
+from __future__ import annotations
+
+import igl
+import numpy as np
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+
+from mvps.cores import neighbours
+from mvps.mesh import vertex_normals
+from mvps.scene import Float, Int, SignedDistanceGrid, Surface
+from mvps.visibility import ray_caster
+
+MISFIT = 0.2
+"""Share of its signal that a vertex leaves unexplained from which it lies on no surface, or on one that the model does not know: twice what
+makes a model a bad one for a whole object. From 0.1 on digging goes into what merely fits badly, from 0.3 on it comes to rest early
+(docs/method.md)."""
+
+EXACT_CELLS = 3
+"""From the surface; farther off distances count cells."""
+
+
+def beyond_noise(residual: Float, noise: float) -> Float:
+    """What residuals, shares of the signal, are without noise, a share as well."""
+    beyond: Float = np.sqrt(np.maximum(residual**2 - noise**2, 0))
+    return beyond
+
+
+def clearance(surface: Surface, unexplained: Float) -> Float:
+    """L (V,), world units, of a surface whose vertices leave the shares `unexplained` (V,), NaN where none sees them; 0 everywhere where
+    none fits, which says nothing of the shape."""
+    misfits, fits = unexplained > MISFIT, unexplained <= MISFIT
+    found = np.zeros(len(unexplained))
+    if misfits.any() and fits.any():
+        found[misfits] = neighbours(cKDTree(surface.vertices[fits]), surface.vertices[misfits])[0]
+    return found
+
+
+def hidden(surface: Surface, unexplained: Float) -> float:
+    """Mean of L over the vertices that are seen, world units."""
+    return float(clearance(surface, unexplained).sum() / max(1, np.isfinite(unexplained).sum()))
+
+
+def solid(surface: Surface, like: SignedDistanceGrid) -> SignedDistanceGrid:
+    """Signed distance of a closed surface on the nodes of another grid, exact near it."""
+    shape = like.values.shape
+    nodes = like.origin + like.spacing * np.indices(shape).reshape(3, -1).T
+    vertices, faces = np.ascontiguousarray(surface.vertices), np.ascontiguousarray(surface.faces)
+    inside = (igl.fast_winding_number(vertices, faces, nodes) > 0.5).reshape(shape)
+    # A boundary between two nodes is half a cell from either.
+    distance = (np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside)) - 0.5) * like.spacing
+    near = distance.ravel() <= EXACT_CELLS * like.spacing
+    exact = distance.ravel()
+    exact[near] = np.sqrt(np.maximum(igl.point_mesh_squared_distance(nodes[near], vertices, faces)[0], 0))
+    return SignedDistanceGrid(np.where(inside, -1, 1) * exact.reshape(shape), like.origin, like.spacing)
+
+
+def thickness(surface: Surface, vertex: Int) -> Float:
+    """(n,) distance from vertices, numbers (n,), straight inwards to where the solid ends; inf where it does not."""
+    caster, normal = ray_caster(surface), vertex_normals(surface)[vertex]
+    hits = caster.first_hits(surface.vertices[vertex] - caster.offset * normal, -normal)
+    return hits.distance + caster.offset
+
+
+def dug(surface: Surface, unexplained: Float, like: SignedDistanceGrid, share: float = 1.0) -> SignedDistanceGrid:
+    """The solid without the balls, on the nodes of another grid. share: of L that balls have as their radius."""
+    depth = share * clearance(surface, unexplained)
+    vertex = np.flatnonzero(depth >= like.spacing)
+    radius = np.minimum(depth[vertex], thickness(surface, vertex) / 2)
+    grid = solid(surface, like)
+    values = grid.values.copy()
+    for centre, r in zip(surface.vertices[vertex], radius, strict=True):
+        low, high = (np.clip((centre + side * (r + grid.spacing) - grid.origin) / grid.spacing, 0, values.shape) for side in (-1, 1))
+        low, high = np.floor(low).astype(int), np.ceil(high).astype(int) + 1
+        box = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        around = values[box]
+        offset = grid.origin + grid.spacing * (low + np.indices(around.shape).reshape(3, -1).T) - centre
+        np.maximum(around, (r - np.linalg.norm(offset, axis=1)).reshape(around.shape), out=around)
+    return SignedDistanceGrid(values, grid.origin, grid.spacing)
