@@ -30,6 +30,10 @@ GOOD_HULL = 0.2
 """Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
 captures, docs/method.md), so it would do no better."""
 
+WORTHWHILE = 0.9
+"""Of the mean share that was unexplained, what is left at most where hollows that were dug stay. Another coarse round alone leaves 0.9 to
+0.96 of it (docs/method.md)."""
+
 DEPTHS = (1.0, 0.5)
 """Of pits, over the width of the patch: half as deep where as deep as wide is not better."""
 
@@ -160,8 +164,8 @@ def hollowed(
     def worth_digging(of: Refined) -> bool:
         return hidden(of.surface, unexplained(of)) > HIDDEN * pixel
 
-    def better(after: Refined, before: Refined) -> bool:
-        return bool(np.nanmean(unexplained(after)) < np.nanmean(unexplained(before)))
+    def better(after: Refined, before: Refined, share: float = 1.0) -> bool:
+        return bool(np.nanmean(unexplained(after)) < share * np.nanmean(unexplained(before)))
 
     best, rounds = found, list[dict[str, float]]()
     for depth in DEPTHS:
@@ -178,7 +182,7 @@ def hollowed(
             field = Occupancy(capture, solid(trial.surface, grid), CONTINUED, settings.seed, chosen_device(settings.device))
             surface = stage_one(field, trial.maps, CONTINUED, progress)
             trial = stage_two("coarse refinement", capture, surface, trial, of_turn, settings, progress)
-            if not better(trial, best):
+            if not better(trial, best, WORTHWHILE):
                 break
             best, rounds = trial, rounds + taken + trial.rounds
     return best, rounds

@@ -14,7 +14,6 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from mvps.coarse import Step, begin, coarse, stage_two
 from mvps.command import lights_argument, number_list, parse, parser, positive, run
 from mvps.finding import Finding
 from mvps.inputs import shown
@@ -25,6 +24,7 @@ from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruc
 
 if TYPE_CHECKING:
     from mvps.checkpoint import Checkpoints
+    from mvps.coarse import Step
     from mvps.joint.refine import Refined
     from mvps.plan import Parts
 
@@ -85,6 +85,7 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
 
 def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step) -> Refined:
     """Stage II on the hull alone."""
+    from mvps.coarse import begin, stage_two
     from mvps.plan import first_pass
 
     begun, plan = begin(used, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, True))
@@ -103,6 +104,7 @@ def reconstruct(
 ) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
+    from mvps.coarse import coarse, stage_two
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT

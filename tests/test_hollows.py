@@ -98,14 +98,15 @@ def test_nothing_to_dig_leaves_the_solid() -> None:
     ("left", "made", "kept"),
     [
         ((0.01,), 0, 0),
-        ((1.0, 1.1, 0.9, 0.01, 0.005), 4, 4),
+        ((1.0, 1.1, 0.8, 0.01, 0.005), 4, 4),
         ((1.0, 1.1, 1.2, 1.1, 1.3), 4, 0),
+        ((1.0, 1.1, 0.92, 1.1, 0.95), 4, 0),
         ((1.0, 0.8, 0.6, 0.7, 0.5, 0.55, 0.56, 0.6, 0.6), 8, 4),
         ((1.0, 1.1, 1.2, 0.9, 0.95, 0.01), 5, 3),
         ((1.0, 0.01, 0.005), 2, 2),
-        (tuple(0.9 + 0.1 / k for k in range(1, 100)), 2 * MOST_TURNS * (MOST_TURNS + 1), 2 * MOST_TURNS * (MOST_TURNS + 1)),
+        (tuple(0.9815**k for k in range(100)), 2 * MOST_TURNS * (MOST_TURNS + 1), 2 * MOST_TURNS * (MOST_TURNS + 1)),
     ],
-    ids=["no sign", "better in the end", "worse", "two turns, the second worse", "half as deep", "one pit", "ever better"],
+    ids=["no sign", "better in the end", "worse", "hardly better", "two turns, the second worse", "half as deep", "one pit", "ever better"],
 )
 def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """left: what the patch leaves unexplained, as found and after every round. Two rounds (pit, Stage I) are a turn at least."""
