@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -31,6 +32,14 @@ def at_a_time() -> int:
 def work_on(most: int) -> None:
     """No more than `most` things at a time from now on, in this process; at least one, no more than cores."""
     _most[0] = max(1, min(most, len(os.sched_getaffinity(0))))
+
+
+def blas_as_asked() -> None:
+    """As many threads of BLAS as the environment says (mvps/__init__.py), also where numpy was imported before this package: other numbers
+    give other last bits, and threads on top of ours only wait for each other."""
+    asked = os.environ["OPENBLAS_NUM_THREADS"]
+    if asked.isdecimal() and int(asked) > 0:
+        threadpool_limits(int(asked), "blas")
 
 
 def on_cores(task: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:

@@ -105,12 +105,14 @@ def reconstruct(
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
     from mvps.coarse import coarse, stage_two
+    from mvps.cores import blas_as_asked
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
     from mvps.plan import Parts, last_pass
     from mvps.pyramid import halvings
 
+    blas_as_asked()
     parts = parts or Parts()
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     if len(used.views) == 1:

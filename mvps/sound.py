@@ -13,6 +13,7 @@ from mvps.checks.photographs import photographs
 from mvps.checks.poses import poses
 from mvps.checks.radiometry import curve_undone
 from mvps.checks.silhouettes import silhouettes
+from mvps.cores import blas_as_asked
 from mvps.finding import Finding
 from mvps.progress import Progress
 from mvps.scene import Capture
@@ -26,6 +27,7 @@ all have in common; where the cameras are, which trusts masks and photographs.""
 
 def sound(capture: Capture, progress: Progress) -> tuple[Capture, list[Finding]]:
     """The capture as it is reconstructed, and what was wrong with it."""
+    blas_as_asked()
     findings: list[Finding] = []
     with progress.stage("checks") as stage:
         for check in CHECKS:
