@@ -27,7 +27,7 @@ from mvps.layers import rendered
 from mvps.load import read_capture
 from mvps.mesh import normalise
 from mvps.pbr import glossy
-from mvps.rendering import diffuse_shading, light_sources, points_under, shadow_at, specular_shading
+from mvps.rendering import diffuse_shading, light_senders, points_under, shadow_at, specular_shading
 from mvps.scene import Capture, Reconstruction, View
 from mvps.visibility import ray_caster
 
@@ -65,14 +65,14 @@ def photographs(result: Reconstruction, capture: Path) -> Capture:
 def pairs(result: Reconstruction, model: Model, chosen: Capture) -> Iterator[Pair]:
     """Photograph by photograph."""
     caster, material, shown = ray_caster(result.surface), result.material, mesh(model)
-    sources = light_sources(result.surface, material)
+    senders = light_senders(result.surface, material)
     for view in chosen.views:
         camera, at = sensor(view.camera), result.views.index(view.name)
         for k, number in enumerate(view.lights):
             row = result.light_names[at].index(number)
             direction, intensity = result.lights.direction[at][row], result.lights.intensity[at][row]
             light = Illumination(direction[None], intensity[None])
-            layers, coverage = rendered(caster, material, view.camera, light, ("image", "shadow"), sources)
+            layers, coverage = rendered(caster, material, view.camera, light, ("image", "shadow"), senders)
             direct, _ = rendered(caster, material, view.camera, light, ("image",))
             # glTF's reflectance is ours over pi times the scale.
             other, covered = render(shown, camera, direction, np.pi * model.extras["albedo_scale"] * intensity)

@@ -39,13 +39,23 @@ NEIGHBOURS = 4
 
 @dataclass(frozen=True, eq=False)
 class Gather:
-    """The mesh's ray caster; n patches with a vertex each: its index and normal (n, 3); S (n, n)."""
+    """The mesh's ray caster; n patches with a vertex each: its index and normal (n, 3); S (n, n); the tree of their places;
+    spread (n,) variance of its vertices' normals about its own, along a tangent.
+
+    Of the rays that meet another part: row (rays,) patch that they start from, in order, start (n + 1,) where a patch's begin; column
+    (rays,) patch that they meet; along (rays, 3) unit.
+    """
 
     caster: RayCaster
     vertex: Int
     normal: Float
     S: sp.csr_matrix
     tree: cKDTree
+    spread: Float
+    row: Int
+    start: Int
+    column: Int
+    along: NDArray[np.float32]
 
 
 def gather(surface: Surface, size: float) -> Gather:
@@ -66,7 +76,9 @@ def gather(surface: Surface, size: float) -> Gather:
     rows = seen // RAYS
     columns = patch[surface.faces[hits.face[seen], 0]]
     S = sp.csr_matrix((np.full(len(rows), 1 / RAYS, np.float32), (rows, columns)), (len(vertex), len(vertex)))
-    return Gather(caster, vertex, normal, S, cKDTree(places))
+    spread = np.bincount(patch, ((normals - normal[patch]) ** 2).sum(1) / 2) / np.bincount(patch)
+    start = np.searchsorted(rows, np.arange(len(vertex) + 1))
+    return Gather(caster, vertex, normal, S, cKDTree(places), spread, rows, start, columns, directions[seen].astype(np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,13 +89,8 @@ class Sources:
     albedo: Float
 
 
-def coarse_sources(surface: Surface, albedo: Float) -> Sources:
-    """The sources of a surface whose vertices have `albedo` (V,) or (V, channels)."""
-    return sources_on(gather(surface, PATCH_EDGES * mean_edge_length(surface)), surface, albedo)
-
-
 def sources_on(of: Gather, surface: Surface, albedo: Float) -> Sources:
-    """The same on the patches of an earlier surface that is about the same."""
+    """The sources of a surface whose vertices have `albedo` (V,) or (V, channels), on patches of it or of one that is about the same."""
     weight = interpolation(of, surface.vertices, vertex_normals(surface)).T.tocsr()
     total = np.asarray(weight.sum(1))[:, 0]
     near = total > 1e-6
@@ -130,7 +137,7 @@ def gathered(sources: Sources, direction: Float, bounce: float) -> NDArray[np.fl
 
 
 def at(sources: Sources, G: NDArray[np.float32], points: Float, normal: Float) -> NDArray[np.float32]:
-    """G interpolated at points with normals (points, 3): (points, lights) or (points, lights, channels)."""
+    """G (n, ...) interpolated at points with normals (points, 3)."""
     weight = interpolation(sources.of, points, normal)
     values: NDArray[np.float32] = (weight @ G.reshape(len(G), -1)).reshape(len(points), *G.shape[1:])
     return values

@@ -6,7 +6,7 @@
     lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
-                             grazing, bounce (numbers), microfacet, shadows (truth values); with a neural residual also
+                             grazing, bounce, gleam (numbers), microfacet, shadows (truth values); with a neural residual also
                              residual_share (V,), residual_code (V, codes), residual_weight_K (out, in) and residual_bias_K (out,) of its
                              layers K = 0, 1, ...
     normals/NAME.npy, .png   (height, width, 3) float32 world frame, NaN outside the mask; the picture shows (normal + 1) / 2
@@ -154,7 +154,7 @@ def check_account(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> No
 
 
 _MATERIAL = ("albedo", "specular_weight", "sharpness", "confidence")
-_OF_ALL = {"grazing": float, "bounce": float, "microfacet": bool, "shadows": bool}
+_OF_ALL = {"grazing": float, "bounce": float, "gleam": float, "microfacet": bool, "shadows": bool}
 
 
 def _residual(arrays: Mapping[str, Any]) -> Residual | None:

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mvps.bounce import Sources
 from mvps.camera import view_directions
+from mvps.gleam import Senders
 from mvps.illumination import Illumination
 from mvps.mesh import lengths
 from mvps.rendering import Points, light_arriving, points_under, shaded, shadow_at, specular_shading
@@ -35,14 +35,14 @@ SAMPLES_PER_CHUNK = 1 << 21
 
 
 def rendered(
-    caster: RayCaster, material: Material, camera: Camera, light: Illumination, layers: Sequence[str], sources: Sources | None = None
+    caster: RayCaster, material: Material, camera: Camera, light: Illumination, layers: Sequence[str], senders: Senders | None = None
 ) -> tuple[dict[str, Layer], Layer]:
     """Layers (height, width[, 3]) by name, 0 where nothing is, and coverage (height, width) in [0, 1].
 
     image, specular: linear radiance; albedo; normals: refined ones, world frame; depth: along the optical axis, world units; shadow: part
     of the arriving light that other parts of the surface hide; confidence.
 
-    sources: what sends light on (rendering.light_sources), for inter-reflection of the directional lights; None: without.
+    senders: what sends light on (rendering.light_senders), for inter-reflection of the directional lights; None: without.
     """
     side = int(np.sqrt(SUBPIXELS))
     fine = Camera(np.diag([side, side, 1.0]) @ camera.K, camera.rotation, camera.translation, side * camera.height, side * camera.width)
@@ -52,7 +52,7 @@ def rendered(
         row, column = divmod(k, side)
         pixels = side * np.argwhere(np.ones(count.shape, bool)) + (row, column)
         share = _share(light, k)
-        found, hit = _of_pixels(caster, material, fine, pixels, share, layers, sources)
+        found, hit = _of_pixels(caster, material, fine, pixels, share, layers, senders)
         count += hit.reshape(count.shape)
         for name, values in found.items():
             whole = values.reshape(*count.shape, *values.shape[1:])
@@ -72,7 +72,7 @@ def _share(light: Illumination, k: int) -> Illumination:
 
 
 def _of_pixels(
-    caster: RayCaster, material: Material, camera: Camera, pixels: Int, light: Illumination, layers: Sequence[str], sources: Sources | None
+    caster: RayCaster, material: Material, camera: Camera, pixels: Int, light: Illumination, layers: Sequence[str], senders: Senders | None
 ) -> tuple[dict[str, Layer], Bool]:
     """Layers (n[, 3]) of pixels (n, 2), 0 where nothing is hit, and where something is."""
     points = points_under(caster, material, camera, pixels)
@@ -81,7 +81,7 @@ def _of_pixels(
     found: dict[str, Float] = {"albedo": seen.albedo, "normals": seen.normal, "confidence": seen.confidence}
     found["depth"] = (seen.position @ camera.rotation.T + camera.translation)[:, 2]
     if {"image", "specular", "shadow"} & set(layers):
-        found |= _lit(caster, material, camera, seen, light, sources)
+        found |= _lit(caster, material, camera, seen, light, senders)
 
     def spread(values: Float) -> Layer:
         whole = np.zeros((len(pixels), *values.shape[1:]), np.float32)
@@ -92,7 +92,7 @@ def _of_pixels(
 
 
 def _lit(
-    caster: RayCaster, material: Material, camera: Camera, points: Points, light: Illumination, sources: Sources | None
+    caster: RayCaster, material: Material, camera: Camera, points: Points, light: Illumination, senders: Senders | None
 ) -> dict[str, Float]:
     """image, specular (n, 3) and shadow (n,)."""
     view = view_directions(camera, points.position)
@@ -107,9 +107,10 @@ def _lit(
         specular += np.einsum("nlc,nl,lc->nc", np.broadcast_to(lobes, (*shadow.shape, 3)), ~shadow, intensity)
         flux = np.maximum(points.normal @ direction.T, 0) * intensity.mean(1)
         hidden, arriving = hidden + (flux * shadow).sum(1), arriving + flux.sum(1)
-        others = light_arriving(sources, material, direction)
+        others = light_arriving(senders, direction, camera.centre)
         if others is not None:
-            image += points.albedo * np.einsum("nlc,lc->nc", others.at(points.position, points.mesh_normal), intensity)
+            of_albedo, of_lobes = others.at(points)
+            image += np.einsum("nlc,lc->nc", points.albedo[:, None] * of_albedo + of_lobes, intensity)
     for position, strength in zip(light.position, light.strength, strict=True):
         apart = position - points.position
         distance = lengths(apart)[:, None]

@@ -41,16 +41,17 @@ objects."""
 
 @dataclass(frozen=True)
 class Model:
-    """sharpness of the lobes; whether the diffuse term changes at grazing angles; whether surfaces light each other; whether a neural
-    residual takes what is left."""
+    """sharpness of the lobes; whether the diffuse term changes at grazing angles; whether surfaces light each other, diffusely and by their
+    lobes; whether a neural residual takes what is left."""
 
     sharpness: tuple[float, ...] = ()
     grazing: bool = False
     bounce: bool = False
+    gleam: bool = False
     neural: bool = False
 
 
-LARGEST = Model(SHARPNESS, True, True, True)
+LARGEST = Model(SHARPNESS, True, True, True, True)
 """All components there are."""
 
 

@@ -23,7 +23,7 @@ from mvps.load import read_capture, read_environment
 from mvps.mesh import lengths, normalise
 from mvps.pbr import srgb_bytes, white_level
 from mvps.progress import Progress
-from mvps.rendering import light_sources
+from mvps.rendering import light_senders
 from mvps.scene import Camera, CaptureError, Float, Reconstruction
 from mvps.texture import png_bytes
 from mvps.viewpoints import ball_around, look_at, read_cameras, turntable
@@ -49,12 +49,12 @@ def write_pictures(given: Namespace) -> None:
         environment = environment_lights(read_environment(given.envmap), given.envmap_lights, np.array(given.up), given.envmap_turn)
     encoder = ffmpeg() if given.video else ""
     caster = ray_caster(result.surface)
-    sources = None if given.no_bounce else light_sources(result.surface, material)
+    senders = None if given.no_bounce else light_senders(result.surface, material)
     exposure = given.exposure if "exposure" in given else 0.0
     with appearing_whole(given.out) as writing, Progress().stage("render", total=len(cameras)) as stage:
         for name, camera in cameras.items():
             light = chosen_light(given, camera, environment, ball_around(result.surface)[0])
-            found, coverage = rendered(caster, material, camera, light, given.layers, sources)
+            found, coverage = rendered(caster, material, camera, light, given.layers, senders)
             if "image" in found and not exposure:
                 exposure = 1 / white_level(found["image"][coverage > 0])
             for layer, values in found.items():

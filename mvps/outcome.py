@@ -126,6 +126,7 @@ def told(
         "sharpness": list(refined.law.sharpness),
         "grazing": refined.law.grazing,
         "bounce": refined.law.bounce,
+        "gleam": refined.law.gleam,
         "share_with_neural_residual": 0.0 if refined.material.residual is None else float(refined.material.residual.share.mean()),
     }
     return Reconstruction(

@@ -1,6 +1,6 @@
 """From albedo and spherical Gaussians to the metallic-roughness model of glTF 2.0 (its appendix B, KHR_materials_specular).
 
-Ours, pi times the reflection factor up to the unknown exposure g:   albedo + sum_k w_k lobe_k(h.n)
+Ours, pi times the reflection factor up to the unknown exposure g:   albedo + sum_k w_k lobe_k(h.n) / (h.v)^2
 glTF's, times pi:           base (1 - max F) + pi F D V,   F = F0 + (1 - F0) (1 - v.h)^5,   D GGX of alpha = roughness^2, V Smith's
 
 alpha and F0 are those with which g F0 pi D V comes closest to the lobes, by least squares over the directions that a camera sees beside
@@ -65,10 +65,10 @@ def glossy(specular_weight: Float, law: Law) -> tuple[Float, Float]:
 @lru_cache(maxsize=8)
 def _alike(law: Law) -> tuple[Float, NDArray[np.float32], NDArray[np.float32]]:
     """alpha (ALPHAS,) that are tried; M (lobes, ALPHAS); |pi D V| (ALPHAS,)."""
-    n_dot_l, n_dot_v, h_dot_n, share = _directions()
+    n_dot_l, n_dot_v, h_dot_n, h_dot_v, share = _directions()
     widest, sharpest = (np.sqrt(2 / s) for s in (min(law.sharpness), max(law.sharpness)))
     alpha = np.geomspace(np.clip(sharpest / 2, SMOOTHEST, 1), np.clip(2 * widest, SMOOTHEST, 1), ALPHAS)
-    ours = lobes_of(h_dot_n, law) * (share * n_dot_l)[:, None]
+    ours = lobes_of(h_dot_n, law) * (share * n_dot_l / h_dot_v**2)[:, None]
     square = alpha**2
     smith = [x[:, None] + np.sqrt(square + (1 - square) * x[:, None] ** 2) for x in (n_dot_l, n_dot_v)]
     ggx = square / (h_dot_n[:, None] ** 2 * (square - 1) + 1) ** 2 / (smith[0] * smith[1]) * (share * n_dot_l)[:, None]
@@ -76,9 +76,9 @@ def _alike(law: Law) -> tuple[Float, NDArray[np.float32], NDArray[np.float32]]:
     return alpha, (ours.T @ ggx / length).astype(np.float32), length.astype(np.float32)
 
 
-def _directions() -> tuple[Float, Float, Float, Float]:
-    """n.l, n.v, h.n (n,) of pairs of light and view up to SPREAD apart, and the root of their share of a picture: pixels, that is n.v of
-    solid angle, times the light's solid angle. Half vectors lie densely around the normal, where sharp lobes are."""
+def _directions() -> tuple[Float, Float, Float, Float, Float]:
+    """n.l, n.v, h.n, h.v (n,) of pairs of light and view up to SPREAD apart, and the root of their share of a picture: pixels, that is n.v
+    of solid angle, times the light's solid angle. Half vectors lie densely around the normal, where sharp lobes are."""
     t, d, turn = np.meshgrid((np.arange(96) + 0.5) / 96, (np.arange(8) + 0.5) / 8, (np.arange(12) + 0.5) / 12, indexing="ij")
     tilt, apart, around = (a.ravel() for a in (STEEPEST * t**3, SPREAD / 2 * d, 2 * np.pi * turn))
     side = np.sin(tilt) * np.sin(apart) * np.cos(around)
@@ -86,7 +86,7 @@ def _directions() -> tuple[Float, Float, Float, Float]:
     # Of h and the angle between h and v:  dl dv = 4 cos(apart) sin(apart) sin(tilt), and  d tilt ~ t^2 dt.
     share = n_dot_v * np.cos(apart) * np.sin(apart) * np.sin(tilt) * t.ravel() ** 2
     above = (n_dot_l > 0) & (n_dot_v > 0)
-    return n_dot_l[above], n_dot_v[above], np.cos(tilt)[above], np.sqrt(share[above])
+    return n_dot_l[above], n_dot_v[above], np.cos(tilt)[above], np.cos(apart)[above], np.sqrt(share[above])
 
 
 def reflectance_scale(material: Material) -> float:

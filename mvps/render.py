@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from mvps.bounce import Sources
+    from mvps.gleam import Senders
     from mvps.scene import Camera, Reconstruction
     from mvps.visibility import RayCaster
 
@@ -36,11 +36,11 @@ FORMATS = ("png", "png16", "exr")
 
 
 def render_view(
-    caster: RayCaster, reconstruction: Reconstruction, view: str, camera: Camera, sources: Sources | None = None
+    caster: RayCaster, reconstruction: Reconstruction, view: str, camera: Camera, senders: Senders | None = None
 ) -> tuple[NDArray[np.uint16], NDArray[np.bool_]]:
     """Code values (height, width, lights, 3) of a view of the result under its lights, and where the surface is (height, width).
 
-    sources: what sends light to other parts (rendering.light_sources). CaptureError where the result has no such view.
+    senders: what sends light to other parts (rendering.light_senders). CaptureError where the result has no such view.
     """
     import numpy as np
 
@@ -56,7 +56,7 @@ def render_view(
     hit = camera_hits(caster, camera, every).face >= 0
     image = np.zeros((len(every), len(direction), 3), np.uint16)
     chosen = np.flatnonzero(hit)
-    arriving = light_arriving(sources, reconstruction.material, direction)
+    arriving = light_arriving(senders, direction, camera.centre)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(chosen), step):
         part = chosen[start : start + step]
@@ -73,7 +73,7 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
     from mvps.folders import appearing_whole
     from mvps.load import read_capture
     from mvps.progress import Progress
-    from mvps.rendering import light_sources
+    from mvps.rendering import light_senders
     from mvps.scene import CaptureError
     from mvps.texture import png_bytes
     from mvps.visibility import ray_caster
@@ -86,10 +86,10 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
         raise CaptureError(
             f"{capture}: wanted the capture of the result's {', '.join(reconstruction.views)}, given one without these views"
         )
-    caster, sources = ray_caster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
+    caster, senders = ray_caster(reconstruction.surface), light_senders(reconstruction.surface, reconstruction.material)
     with appearing_whole(out) as writing, Progress().stage("render", total=len(chosen)) as stage:
         for view in chosen:
-            image, mask = render_view(caster, reconstruction, view.name, view.camera, sources)
+            image, mask = render_view(caster, reconstruction, view.name, view.camera, senders)
             folder = writing / view.name
             folder.mkdir()
             (folder / "mask.png").write_bytes(png_bytes(np.where(mask, 255, 0).astype(np.uint8)))

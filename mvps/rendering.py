@@ -1,8 +1,10 @@
 """Photographs of a reconstruction: first hits, interpolated material, the image model, cast shadows.
 
-    image(pixel, light) = intensity * (shade(material at the first hit) * residual * (1 - cast_shadow) + albedo * bounce * G)
+    image(pixel, light) = intensity * (shade(material at the first hit) * residual * (1 - cast_shadow)
+                                       + albedo * (bounce * G_0 + gleam * G_1) + gleam * sum_k weight_k * G_2+k)
 
-G is the light that other surfaces send (bounce.py), residual the factor of a material that has a neural residual (neural.py).
+G is the light that other surfaces send (bounce.py, and where lobes take part gleam.py), residual the factor of a material that has a
+neural residual (neural.py).
 
 The shading normal is the material's refined normal; shadows are traced on the mesh.
 """
@@ -16,8 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvps.bounce import Sources, at, coarse_sources, gathered
+from mvps.bounce import at
 from mvps.camera import view_directions
+from mvps.gleam import Senders, coarse_senders, terms
 from mvps.mesh import normalise
 from mvps.neural import factor
 from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
@@ -67,28 +70,34 @@ def shadow_at(caster: RayCaster, law: Law, points: Points, lights: Float) -> Boo
 
 
 class Arriving(NamedTuple):
-    """Light that other surfaces send (bounce.py) under some lights: its sources, and bounce * G (n, lights, 3) on them."""
+    """Light that other surfaces send (gleam.py) under some lights, towards one camera: the senders, and G (n, lights, terms, 3) on them."""
 
-    sources: Sources
+    senders: Senders
     G: NDArray[np.float32]
 
-    def at(self, points: Float, normal: Float) -> NDArray[np.float32]:
-        """(points, lights, 3), per unit albedo and intensity, at points with normals (points, 3)."""
-        return at(self.sources, self.G, points, normal)
+    def at(self, points: Points) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Per unit intensity (points, lights, 3) each: what a unit of albedo returns, and what the points' lobes do."""
+        law = self.senders.law
+        G = at(self.senders.sources, self.G, points.position, points.mesh_normal)
+        of_albedo = np.float32(law.bounce) * G[:, :, 0]
+        if G.shape[2] == 1:
+            return of_albedo, np.zeros_like(of_albedo)
+        of_albedo += np.float32(law.gleam) * G[:, :, 1]
+        weight = points.specular_weight if points.specular_weight.ndim == 3 else points.specular_weight[..., None]
+        weight = np.float32(law.gleam) * np.broadcast_to(weight, (*weight.shape[:2], 3)).astype(np.float32)
+        return of_albedo, np.einsum("nlkc,nkc->nlc", G[:, :, 2:], weight)
 
 
 @lru_cache(maxsize=1)
-def light_sources(surface: Surface, material: Material) -> Sources | None:
+def light_senders(surface: Surface, material: Material) -> Senders | None:
     """What sends light to other parts of the surface; None where the material has no inter-reflection. The last are kept: textures and
     report ask for the same."""
-    return coarse_sources(surface, material.albedo) if material.bounce else None
+    return coarse_senders(surface, material)
 
 
-def light_arriving(sources: Sources | None, material: Material, direction: Float) -> Arriving | None:
-    """What arrives from `sources` under lights direction (lights, 3)."""
-    if sources is None:
-        return None
-    return Arriving(sources, np.float32(material.bounce) * gathered(sources, direction, material.bounce))
+def light_arriving(senders: Senders | None, direction: Float, eye: Float) -> Arriving | None:
+    """What arrives from senders under lights direction (lights, 3), for a camera at eye (3,)."""
+    return None if senders is None else Arriving(senders, terms(senders, direction, eye))
 
 
 def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: float) -> NDArray[np.float32]:
@@ -131,7 +140,7 @@ def photograph(
 ) -> NDArray[np.float32]:
     """Radiance (n, lights, 3) at the centres of pixels (n, 2) under lights direction, intensity (lights, 3); 0 where nothing is hit.
 
-    arriving: inter-reflection under the same lights.
+    arriving: inter-reflection under the same lights, for the same camera.
     """
     points = points_under(caster, material, camera, pixels)
     view = view_directions(camera, points.position)
@@ -143,5 +152,6 @@ def photograph(
         of_part = points.part(part)
         image[part] = shaded(of_part, view[part], material, direction) * lit[part, :, None]
         if arriving is not None:
-            image[part] += of_part.albedo[:, None].astype(np.float32) * arriving.at(of_part.position, of_part.mesh_normal)
+            of_albedo, of_lobes = arriving.at(of_part)
+            image[part] += of_part.albedo[:, None].astype(np.float32) * of_albedo + of_lobes
     return image * intensity.astype(np.float32)

@@ -270,6 +270,7 @@ class Law:
     bounce     diffuse reflectance in [0, 1] over albedo, which is in units of the photographs: strength of inter-reflection; 0 without
     microfacet lobes are distributions of microfacets instead of spherical Gaussians
     shadows    surfaces cast shadows on each other
+    gleam      as bounce, of light that lobes take part in (gleam.py); 0 without
     """
 
     sharpness: tuple[float, ...]
@@ -277,6 +278,7 @@ class Law:
     bounce: float = 0.0
     microfacet: bool = False
     shadows: bool = True
+    gleam: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,7 +316,7 @@ class Material:
     specular_weight  (V, lobes) or (V, lobes, 3), non-negative
     sharpness        (lobes,) of exp(sharpness * (half . normal - 1)), positive
     confidence       (V,) in the normal (RELIABLE); 0 where no photograph saw the vertex
-    grazing, bounce, microfacet, shadows  as in `Law`
+    grazing, bounce, microfacet, shadows, gleam  as in `Law`
     residual         of the reflectance, where albedo and lobes fit badly; None where there is none
     """
 
@@ -327,12 +329,13 @@ class Material:
     bounce: float = 0.0
     microfacet: bool = False
     shadows: bool = True
+    gleam: float = 0.0
     residual: Residual | None = None
 
     @property
     def law(self) -> Law:
         """What all vertices have in common."""
-        return Law(tuple(self.sharpness.tolist()), self.grazing, self.bounce, self.microfacet, self.shadows)
+        return Law(tuple(self.sharpness.tolist()), self.grazing, self.bounce, self.microfacet, self.shadows, self.gleam)
 
     def __post_init__(self) -> None:
         n = len(self.albedo)

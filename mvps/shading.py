@@ -1,7 +1,8 @@
 """The image model: albedo and spherical Gaussians under directional light. Differentiable (torch), any device.
 
-    radiance / intensity = visibility * (albedo D(n . l) D(n . v) + sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0)
+    radiance / intensity = visibility * (albedo D(n . l) D(n . v) + gain sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0)
     h = (v + l) / |v + l|,   so that   h . n = (n . v + n . l) / sqrt(2 + 2 v . l)
+    gain = 1 / (h . v)^2 = 4 / (2 + 2 v . l), STEEPEST at most
     D(x) = 1 + grazing (1 - x)^p
 
 Distributions of microfacets (GGX: Walter et al. 2007, eq. 33, 1 at its peak) may take the Gaussians' place,
@@ -9,6 +10,8 @@ Distributions of microfacets (GGX: Walter et al. 2007, eq. 33, 1 at its peak) ma
     (1 + sharpness (1 - (h . n)^2) / 4)^-2,   which is alpha^4 / (1 - (1 - alpha^2) (h . n)^2)^2 with alpha^2 = 4 / (4 + sharpness),
 
 of the same peak and the same slope there, but with longer tails.
+
+gain is what a distribution of microfacets gains where light and view part, masking included (Kelemen and Szirmay-Kalos 2001, eq. 9).
 
 D is what keeps a diffuse body from being Lambert's: a glossy coat lets less light in and out at grazing angles, a rough body sends more
 back. Product and power follow Schlick 1994 and Burley 2012; p is GRAZING_POWER.
@@ -39,9 +42,24 @@ PARALLEL = 1e-6
 """Floor of 2 + 2 v.l: view and light exactly opposite have no half vector (and such a point is never lit and seen)."""
 
 
+STEEPEST = 4.0
+"""Largest gain: with light and view 120 degrees apart, beyond which microfacets mask each other more than they gain."""
+
+
 def half_length(v_dot_l: Tensor) -> Tensor:
     """|v + l| for v . l."""
     return (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
+
+
+def gain(length: Tensor) -> Tensor:
+    """Of lobes, for |v + l|."""
+    return (4 / length**2).clamp_max(STEEPEST)
+
+
+def gain_of(length: NDArray[np.float32]) -> NDArray[np.float32]:
+    """`gain` of an array."""
+    values: NDArray[np.float32] = gain(torch.from_numpy(length)).numpy()
+    return values
 
 
 def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor:
@@ -50,7 +68,7 @@ def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor
     return ((n_dot_v + n_dot_l) / half_length(v_dot_l)).clamp(-1, 1)
 
 
-def lobe(h_dot_n: Tensor, sharpness: float, microfacet: bool) -> tuple[Tensor, Tensor | float]:
+def lobe(h_dot_n: Tensor, sharpness: float | Tensor, microfacet: bool) -> tuple[Tensor, Tensor | float]:
     """A lobe's value (...) for h . n (...), and the derivative of its logarithm by h . n."""
     if not microfacet:
         return torch.exp((sharpness * (h_dot_n - 1)).clamp_min(FAINTEST)), sharpness
@@ -70,18 +88,25 @@ def lobes_of(h_dot_n: Float, law: Law) -> NDArray[np.float64]:
     return values
 
 
+def lobe_of(h_dot_n: NDArray[np.float32], sharpness: NDArray[np.float32], microfacet: bool) -> NDArray[np.float32]:
+    """`lobe` of arrays, with a sharpness for each value."""
+    values: NDArray[np.float32] = lobe(torch.from_numpy(h_dot_n), torch.from_numpy(sharpness), microfacet)[0].numpy()
+    return values
+
+
 @functools.cache
 def returned(sharpness: tuple[float, ...], microfacet: bool) -> NDArray[np.float64]:
     """(1 + lobes,) what a point returns of light from everywhere, over that of a white diffuse one, by its albedo and weights, seen from
     above: 1 for the albedo, and for a lobe, with u = h.n,
 
-        1/pi int lobe(h.n) n.l dl = 8 int lobe(u) (2 u^2 - 1) u du from sqrt(1/2) to 1
+        1/pi int gain lobe(h.n) n.l dl = 8 int gain lobe(u) (2 u^2 - 1) u du from sqrt(1/2) to 1,     gain = 1 / u^2
     """
     u, weight = np.polynomial.legendre.leggauss(QUADRATURE)
     low = np.sqrt(0.5)
     u = low + (1 - low) * (u + 1) / 2
+    gained = gain(torch.from_numpy(2 * u)).numpy()
     values = (lobe(torch.from_numpy(u), s, microfacet)[0].numpy() for s in sharpness)
-    return np.array([1.0, *(4 * (1 - low) * float(weight @ (value * (2 * u**2 - 1) * u)) for value in values)])
+    return np.array([1.0, *(4 * (1 - low) * float(weight @ (gained * value * (2 * u**2 - 1) * u)) for value in values)])
 
 
 def against(vectors: Tensor, light: Tensor) -> Tensor:
@@ -97,8 +122,9 @@ def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_
     """
     n_dot_l = against(normal, light)
     n_dot_v = (normal * view).sum(-1, keepdim=True)
-    h_dot_n = half_dot_normal(n_dot_v, n_dot_l, against(view, light))
+    v_dot_l = against(view, light)
+    h_dot_n = half_dot_normal(n_dot_v, n_dot_l, v_dot_l)
     D_l, D_v = (1 + law.grazing * (1 - x.clamp_min(0)) ** GRAZING_POWER for x in (n_dot_l, n_dot_v))
     weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None].expand(-1, -1, 3)
-    specular = lobes(h_dot_n, law) @ weight
+    specular = gain(half_length(v_dot_l))[..., None] * (lobes(h_dot_n, law) @ weight)
     return (albedo[:, None] * (D_l * D_v)[..., None] + specular) * n_dot_l.clamp_min(0)[..., None]

@@ -33,7 +33,7 @@ from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, proj
 from mvps.cores import one_by_one
 from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
 from mvps.pbr import glossy, srgb_bytes, white_level
-from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_sources, points_under, shadow_at, specular_shading
+from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_senders, points_under, shadow_at, specular_shading
 from mvps.scene import Bool, Capture, Float, Int, Law, Lights, Material, Surface, View
 from mvps.visibility import RayCaster, ray_caster
 
@@ -182,7 +182,8 @@ def pixel_albedo(
         # Channels first: numpy's loops are fast along a long last axis.
         diffuse = np.broadcast_to(body, (3, *body.shape))
         if arriving is not None:
-            diffuse = diffuse + np.moveaxis(arriving.at(points.position, points.mesh_normal), -1, 0)
+            of_albedo, of_lobes = arriving.at(points)
+            diffuse, highlight = diffuse + np.moveaxis(of_albedo, -1, 0), highlight + of_lobes
         white = np.moveaxis(view.samples[part], -1, 0).astype(np.float32) * (view.scale / ratio.T[:, None]).astype(np.float32)
         measured = white - np.moveaxis(highlight, -1, 0) * level
         position[part] = points.position
@@ -229,12 +230,12 @@ def _photographed_albedo(
     surface: Surface, material: Material, lights: Lights, capture: Capture, position: Float, normal: Float
 ) -> tuple[Float, Bool]:
     """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
-    caster, sources = ray_caster(surface), light_sources(surface, material)
+    caster, sent = ray_caster(surface), light_senders(surface, material)
     total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
 
     def solved(i: int) -> list[tuple[Int, Float, Float]]:
         view, direction, intensity = capture.views[i], lights.direction[i], lights.intensity[i]
-        arriving = light_arriving(sources, material, direction)
+        arriving = light_arriving(sent, direction, view.camera.centre)
         hit, albedo, known = pixel_albedo(caster, material, view, direction, intensity, arriving)
         known &= away_from_border(view)
         parts = []

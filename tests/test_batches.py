@@ -28,7 +28,8 @@ def problem() -> tuple[list[ViewSamples], Vertices, list[DirectionalLights]]:
     for n, count in zip(PAIRS, LIGHTS, strict=True):
         image, gathered, weight = (torch.rand(n, count, generator=g, dtype=torch.float64) for _ in range(3))
         seen = torch.randperm(40, generator=g)[:n]
-        views.append(ViewSamples(seen, unit(g, n), weight[:, 0], image, image > 0.2, gathered))
+        terms = torch.stack([gathered, weight, gathered * weight, image], -1)
+        views.append(ViewSamples(seen, unit(g, n), weight[:, 0], image, image > 0.2, terms))
         lights.append(DirectionalLights(unit(g, count), 0.5 + torch.rand(count, generator=g, dtype=torch.float64)))
     return views, vertices, lights
 
@@ -53,7 +54,7 @@ def test_equations_do_not_depend_on_what_goes_together(
     problem: tuple[list[ViewSamples], Vertices, list[DirectionalLights]], monkeypatch: pytest.MonkeyPatch, samples: int
 ) -> None:
     views, vertices, lights = problem
-    law = Law((8.0, 32.0), 0.2, 0.7)
+    law = Law((8.0, 32.0), 0.2, 0.7, gleam=0.3)
     alone = [vertex_equations([view], vertices, [of_view], law) for view, of_view in zip(views, lights, strict=True)]
     monkeypatch.setattr(observe, "SAMPLES_PER_CHUNK", samples)
     together = vertex_equations(views, vertices, lights, law)

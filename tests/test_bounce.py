@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
-from mvps.bounce import Gather, at, coarse_sources, gather, gathered
-from mvps.mesh import vertex_normals
+from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, sources_on
+from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Surface
 
 
@@ -24,6 +24,10 @@ def hollow() -> Surface:
     """The inside of a ball: faces turned inwards."""
     outside = ball()
     return Surface(outside.vertices, outside.faces[:, ::-1])
+
+
+def coarse_sources(surface: Surface, albedo: np.ndarray) -> Sources:
+    return sources_on(gather(surface, PATCH_EDGES * mean_edge_length(surface)), surface, albedo)
 
 
 def test_a_convex_body_sends_itself_nothing() -> None:

@@ -45,8 +45,8 @@ def test_derivatives_against_finite_differences(situation: str, microfacet: bool
     normal, light = (torch.nn.functional.normalize(v, dim=0)[None] for v in (normal, light))
     view = torch.nn.functional.normalize(torch.tensor([[0.05, 0.1, 1.0]], dtype=torch.float64), dim=1)
     reflectance = torch.tensor([[0.4, 0.3]], dtype=torch.float64)
-    intensity, gathered = torch.tensor([1.3], dtype=torch.float64), torch.tensor([[0.2]], dtype=torch.float64)
-    law = Law((sharpness,), -0.3, 0.7, microfacet)
+    intensity, gathered = torch.tensor([1.3], dtype=torch.float64), torch.tensor([[[0.2, 0.1, 0.3]]], dtype=torch.float64)
+    law = Law((sharpness,), -0.3, 0.7, microfacet, gleam=0.4)
     frame = tangents(normal)
 
     def image(turn: torch.Tensor, values: torch.Tensor, m: torch.Tensor) -> torch.Tensor:
@@ -64,7 +64,7 @@ def test_derivatives_against_finite_differences(situation: str, microfacet: bool
     assert torch.allclose(by_light, numeric[2][0], atol=1e-10)
     step = 1e-6
     by_law = law_derivatives(shaded, reflectance, lights, law)
-    for name, derivative in zip(("grazing", "bounce"), by_law, strict=True):
+    for name, derivative in zip(("grazing", "bounce", "gleam"), by_law, strict=True):
         after, before = (
             evaluate(normal, reflectance, view, lights, replace(law, **{name: getattr(law, name) + s}), gathered).predicted
             for s in (step, -step)

@@ -53,6 +53,7 @@ def test_no_other_roughness_comes_nearer_to_the_lobes() -> None:
     lights, normals = lights[lit], normals[lit]
     h_dot_n = (normalise(lights + view) * normals).sum(1)
     lobes = np.exp(np.array(law.sharpness) * (h_dot_n[:, None] - 1)) @ weight[0] * (lights * normals).sum(1)
+    lobes /= (normalise(lights + view) @ view) ** 2
 
     def error(roughness: float, f0: float) -> float:
         theirs = np.array([gltf_times_pi(light[None], view, n, roughness, f0)[0] for light, n in zip(lights, normals, strict=True)])

@@ -1,9 +1,10 @@
 """The image model: laws of the shading formula."""
 
+import pytest
 import torch
 
 from mvps.scene import Law
-from mvps.shading import half_dot_normal, lobe, lobes, shade
+from mvps.shading import STEEPEST, gain, half_dot_normal, half_length, lobe, lobes, shade
 
 N = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
 
@@ -21,11 +22,17 @@ def test_attached_shadow_is_black() -> None:
     assert (shaded(unit(0, 0, 1), unit(1, 0, -0.01)) == 0).all()
 
 
-def test_lobe_peaks_at_its_weight_where_the_half_vector_is_the_normal() -> None:
+def test_lobe_peaks_at_its_gained_weight_where_the_half_vector_is_the_normal() -> None:
     view, light = unit(0.5, 0, 1), unit(-0.5, 0, 1)
-    expected = (torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64) + 0.5) * light[0, 2]
+    # Light and view part by twice the angle whose cosine is that of either to the normal.
+    expected = (torch.tensor([0.2, 0.3, 0.4], dtype=torch.float64) + 0.5 / light[0, 2] ** 2) * light[0, 2]
     assert torch.allclose(shaded(view, light), expected)
     assert (shaded(view, unit(-0.4, 0, 1)) / unit(-0.4, 0, 1)[0, 2] < expected / light[0, 2]).all()
+
+
+def test_gain_is_one_with_light_at_the_camera_and_bounded_when_they_part() -> None:
+    assert gain(half_length(torch.tensor(1.0))) == 1
+    assert gain(half_length(torch.tensor([-0.5, -0.9, -1.0]))).tolist() == pytest.approx([STEEPEST] * 3)
 
 
 def test_reflectance_is_reciprocal() -> None:

@@ -42,7 +42,7 @@ def quick_model(capture: Capture, device: Device) -> Model:
     among = np.zeros(len(surface.vertices), bool)
     among[np.random.default_rng(0).permutation(len(among))[:LIGHT_VERTICES]] = True
     # What other surfaces send is left to the vertices' albedo: it hardly changes along a pixel.
-    return Model(surface, refined.lights, vertices, replace(refined.law, bounce=0.0), among)
+    return Model(surface, refined.lights, vertices, replace(refined.law, bounce=0.0, gleam=0.0), among)
 
 
 def by_photographs(capture: Capture, body: Object) -> tuple[Capture, list[float]]:

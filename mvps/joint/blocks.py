@@ -2,15 +2,16 @@
 
 For a vertex with normal n, grey albedo a and lobe weights w_k, seen along v under light m = e l (e intensity, l unit):
 
-    c = |v + l| = sqrt(2 + 2 v.l),   h.n = (n.v + n.l) / c,   E_k = exp(s_k (h.n - 1)),   q = e max(n.l, 0)
-    I = q R + a b e G,     R = a D_l D_v + sum_k w_k E_k,     B = sum_k s_k w_k E_k
+    c = |v + l| = sqrt(2 + 2 v.l),   h.n = (n.v + n.l) / c,   E_k = 4 / c^2 exp(s_k (h.n - 1)),   q = e max(n.l, 0)
+    I = q R + e (a b G_0 + y (a G_1 + sum_k w_k G_2+k)),     R = a D_l D_v + sum_k w_k E_k,     B = sum_k s_k w_k E_k
 
-with D_x = 1 + g (1 - n.x)^p (shading.py) and b e G the light that other surfaces send (bounce.py)
+with D_x = 1 + g (1 - n.x)^p (shading.py) and G the light that other surfaces send (bounce.py, and where lobes take part gleam.py)
 
     dI/dn = e [n.l > 0] R l + q a (D_l' D_v l + D_l D_v' v) + q B (l + v) / c
-    dI/da = q D_l D_v + b e G,   dI/dw_k = q E_k
-    dI/dm = [n.l > 0] R n + max(n.l, 0) (1 - l l^T) (a D_l' D_v n + B (n / c - (h.n) v / c^2)) + a b G l   (the half vector moves with l)
-    dI/dg = q a ((1 - n.l)^p D_v + (1 - n.v)^p D_l),   dI/db = a e G
+    dI/da = q D_l D_v + e (b G_0 + y G_1),   dI/dw_k = q E_k + y e G_2+k
+    dI/dm = [n.l > 0] R n + max(n.l, 0) (1 - l l^T) (a D_l' D_v n + B (n / c - (h.n) v / c^2) - 2 sum_k w_k E_k v / c^2) + I_G / e l
+            (the half vector moves with l; the last term in the bracket only below the gain's bound, shading.STEEPEST)
+    dI/dg = q a ((1 - n.l)^p D_v + (1 - n.v)^p D_l),   dI/db = a e G_0,   dI/dy = e (a G_1 + sum_k w_k G_2+k)
 
 Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale per vertex, the standard deviation of its weighted residuals.
 Every block is Gauss-Newton: normal equations are accumulated over batches of pairs, never a Jacobian as a whole, and add up over views.
@@ -30,7 +31,7 @@ from torch.nn.utils.rnn import pad_sequence
 from mvps.cores import on_cores
 from mvps.joint.observe import ViewSamples
 from mvps.scene import GRAZING_POWER, Law
-from mvps.shading import half_length, lobe
+from mvps.shading import STEEPEST, gain, half_length, lobe
 from solvers.low_rank import CAUCHY_95
 
 WORKERS = 2
@@ -90,7 +91,7 @@ class Batch:
     """Samples of k views with equally many lights that are handled at once: n pairs of each, fewer filled up with pairs of no weight.
 
     views: their numbers; vertex (k, n); towards (k, n, 3); weight (k, n, lights) of the samples, 0 where they are no data; image
-    (k, n, lights); gathered (k, n, lights) or None; lights: direction (k, lights, 3), intensity (k, 1, lights).
+    (k, n, lights); gathered (k, n, lights, terms) or None; lights: direction (k, lights, 3), intensity (k, 1, lights).
     """
 
     views: list[int]
@@ -152,8 +153,8 @@ def batches(views: list[ViewSamples], lights: list[DirectionalLights]) -> Iterat
 @dataclass(frozen=True)
 class Shaded:
     """The image model on a batch of pairs, (..., n, lights) each: lit 1 above the horizon; n . l clamped at 0; h . n; c; basis dI/da and
-    q E_k; reflectance R; slope B; of_light a D_l' D_v, of_view a D_l D_v'; missing (1 - n.l)^p and (1 - n.v)^p (..., n, 1); indirect
-    a e G; predicted I."""
+    dI/dw_k; reflectance R, its lobes' part; slope B; of_light a D_l' D_v, of_view a D_l D_v'; missing (1 - n.l)^p and (1 - n.v)^p
+    (..., n, 1); indirect a e G_0 and gleamed dI/dy; rest, all that other surfaces send; predicted I."""
 
     lit: Tensor
     n_dot_l: Tensor
@@ -161,11 +162,14 @@ class Shaded:
     c: Tensor
     basis: list[Tensor]
     reflectance: Tensor
+    specular: Tensor
     slope: Tensor
     of_light: Tensor
     of_view: Tensor
     missing: tuple[Tensor, Tensor]
     indirect: Tensor
+    gleamed: Tensor
+    rest: Tensor
     predicted: Tensor
 
 
@@ -173,7 +177,7 @@ def evaluate(
     normal: Tensor, reflectance: Tensor, towards: Tensor, lights: DirectionalLights, law: Law, gathered: Tensor | None = None
 ) -> Shaded:
     """The image model for normal, towards (..., n, 3) and reflectance (..., n, 1 + lobes) under all lights of a view, or of several that
-    stand first (Batch). gathered (..., n, lights): G."""
+    stand first (Batch). gathered (..., n, lights, 1 or 2 + lobes): G."""
     light, intensity = lights.direction, lights.intensity
     n_dot_l = (normal @ light.mT).clamp_min(0)
     n_dot_v = (normal * towards).sum(-1, keepdim=True)
@@ -185,20 +189,30 @@ def evaluate(
     # Factors of a point alone are multiplied before those of its samples.
     D_l, D_v, slant = 1 + law.grazing * of_l, 1 + law.grazing * of_v, albedo * law.grazing
     D = D_l * D_v
-    total, slope, basis = albedo * D, torch.zeros_like(q), [q * D]
-    indirect = torch.zeros_like(q)
-    if gathered is not None:
-        unit = intensity * gathered
-        basis, indirect = [basis[0] + law.bounce * unit], albedo * unit
+    specular, slope, basis, gained = torch.zeros_like(q), torch.zeros_like(q), [q * D], gain(c)
     for k, s in enumerate(law.sharpness):
         value, steepness = lobe(half, s, law.microfacet)
+        value = value * gained
         weighted = value * reflectance[..., k + 1, None]
-        total = total + weighted
+        specular = specular + weighted
         slope = slope + steepness * weighted
         basis.append(q * value)
-    predicted = q * total + law.bounce * indirect
+    indirect = gleamed = rest = torch.zeros_like(q)
+    if gathered is not None:
+        received = (intensity[..., None] * gathered).unbind(-1)
+        indirect = albedo * received[0]
+        rest = law.bounce * indirect
+        basis[0] = basis[0] + law.bounce * received[0]
+        if len(received) > 1:
+            gleamed = sum((reflectance[..., k, None] * g for k, g in enumerate(received[1:])), torch.zeros_like(q))
+            rest = rest + law.gleam * gleamed
+            basis = [own + law.gleam * g for own, g in zip(basis, received[1:], strict=True)]
+    total = albedo * D + specular
+    predicted = q * total + rest
     of_light, of_view = slant * D_v * slope_l, slant * slope_v * D_l
-    return Shaded(n_dot_l.sign(), n_dot_l, half, c, basis, total, slope, of_light, of_view, (of_l, of_v), indirect, predicted)
+    return Shaded(
+        n_dot_l.sign(), n_dot_l, half, c, basis, total, specular, slope, of_light, of_view, (of_l, of_v), indirect, gleamed, rest, predicted
+    )
 
 
 def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
@@ -224,18 +238,19 @@ def light_jacobian(shaded: Shaded, normal: Tensor, towards: Tensor, lights: Dire
     along_normal = shaded.n_dot_l * (shaded.slope / shaded.c + shaded.of_light)
     # dI/dm = alpha n + beta v + gamma l
     alpha = shaded.lit * shaded.reflectance + along_normal
-    beta = -shaded.n_dot_l * shaded.slope / shaded.c * shaded.half / shaded.c
+    growing = shaded.specular * (4 / shaded.c**2 < STEEPEST)
+    beta = -shaded.n_dot_l * (shaded.slope * shaded.half + 2 * growing) / shaded.c**2
     v_dot_l = shaded.c**2 / 2 - 1
-    gamma = law.bounce * shaded.indirect / lights.intensity - (along_normal * shaded.n_dot_l + beta * v_dot_l)
+    gamma = shaded.rest / lights.intensity - (along_normal * shaded.n_dot_l + beta * v_dot_l)
     n, v, light = (a @ rotation.mT for a in (normal, towards, lights.direction))
     return alpha[..., None, :] * n[..., None] + beta[..., None, :] * v[..., None] + gamma[..., None, :] * light.mT[..., None, :, :]
 
 
 def law_derivatives(shaded: Shaded, reflectance: Tensor, lights: DirectionalLights, law: Law) -> list[Tensor]:
-    """Derivatives (..., n, lights) of the samples by the law's grazing and bounce; reflectance (..., n, 1 + lobes)."""
+    """Derivatives (..., n, lights) of the samples by the law's grazing, bounce and gleam; reflectance (..., n, 1 + lobes)."""
     of_l, of_v = shaded.missing
     changed = of_l * (1 + law.grazing * of_v) + (1 + law.grazing * of_l) * of_v
-    return [reflectance[..., :1] * lights.intensity * shaded.n_dot_l * changed, shaded.indirect]
+    return [reflectance[..., :1] * lights.intensity * shaded.n_dot_l * changed, shaded.indirect, shaded.gleamed]
 
 
 def robust(residual: Tensor, scale: Tensor) -> Tensor:

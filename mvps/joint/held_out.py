@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mvps.bounce import coarse_sources
+from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.photometry import LIGHT_VERTICES, drawn
@@ -102,12 +102,12 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     vertices = _vertices(material, device)
     products = _lambertian(views, vertices, rotations, one_rig)
     grey = [_from_product(m, rotation) for m, rotation in zip(products, rotations, strict=True)]
-    sources = coarse_sources(surface, material.albedo.mean(1)) if material.bounce else None
+    sent = coarse_senders(surface, material, grey=True)
     for _ in range(2):
         lights = _as_lights(grey, [channel_ratio(e) for e in white], one_rig)
         views = observe(capture, surface, lights, device, shadows=material.law.shadows)
-        if sources is not None:
-            views = with_gathered(views, surface, sources, material.bounce, lights)
+        if sent is not None:
+            views = with_gathered(views, capture, surface, sent, lights)
         for _ in range(STEPS):
             grey = _step(views, vertices, grey, material.law, rotations, one_rig)
     ratios = [channel_ratio(e) for e in white]

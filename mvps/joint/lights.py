@@ -45,8 +45,8 @@ from mvps.shading import returned
 
 VERTICES_PER_BLOCK = 256
 
-OF_LAW = 2
-"""Unknowns of the law: grazing and bounce."""
+OF_LAW = 3
+"""Unknowns of the law: grazing, bounce and gleam."""
 
 LARGEST_GRAZING = 0.9
 """Of the diffuse term's relative change at 90 degrees: none absorbs all there, none doubles."""
@@ -117,10 +117,10 @@ def _sums(
     n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
     size = {rig: len(of_view.intensity) for rig, of_view in zip(rigs, lights, strict=True) if rig >= 0}
     sums = _Sums(
-        like.new_zeros(n, p + 3, p + 3),
+        like.new_zeros(n, p + OF_LAW + 1, p + OF_LAW + 1),
         like.new_zeros(n),
         {rig: like.new_zeros(n, p, 3, count) for rig, count in size.items()},
-        {rig: like.new_zeros(count, 3, 6, dtype=torch.float64) for rig, count in size.items()},
+        {rig: like.new_zeros(count, 3, 3 + OF_LAW + 1, dtype=torch.float64) for rig, count in size.items()},
     )
     first, second = tangents(vertices.normal)
     for batch in batches(views, lights):
@@ -163,25 +163,26 @@ def _coupled(
 
 
 def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
-    """H_mm and g_m; the last two of m are the law's grazing and bounce."""
-    of_law = sums.vertices[:, -3:, -3:].double().sum(0)
+    """H_mm and g_m; the last OF_LAW of m are the law's."""
+    of_law = sums.vertices[:, -OF_LAW - 1 :, -OF_LAW - 1 :].double().sum(0)
     unknowns = 3 * sum(layout.lights) + OF_LAW
     H, g = of_law.new_zeros(unknowns, unknowns), of_law.new_zeros(unknowns)
-    H[-2:, -2:], g[-2:] = of_law[:2, :2], of_law[:2, 2]
+    law = slice(unknowns - OF_LAW, unknowns)
+    H[law, law], g[law] = of_law[:-1, :-1], of_law[:-1, -1]
     for rig, count in enumerate(layout.lights):
         products, start = sums.lights[rig].permute(1, 2, 0), layout.start(rig)
         own = slice(start, start + 3 * count)
         torch.diagonal(H[own, own].view(3, count, 3, count), dim1=1, dim2=3).copy_(products[:, :3])
-        H[own, -2:] = products[:, 3:5].transpose(1, 2).reshape(-1, 2)
-        H[-2:, own] = H[own, -2:].T
-        g[own] = products[:, 5].reshape(-1)
+        H[own, law] = products[:, 3:-1].transpose(1, 2).reshape(-1, OF_LAW)
+        H[law, own] = H[own, law].T
+        g[own] = products[:, -1].reshape(-1)
     return H, g
 
 
-def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, bool]) -> Tensor:
-    """dm of the Schur complement. solved: grazing, bounce."""
+def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, ...]) -> Tensor:
+    """dm of the Schur complement. solved: grazing, bounce, gleam."""
     H, g = _lights_equations(sums, layout)
-    hessian, gradient = sums.vertices[:, :-3, :-3].clone(), sums.vertices[:, :-3, -1].clone()
+    hessian, gradient = (sums.vertices[:, : -OF_LAW - 1, columns].clone() for columns in (slice(-OF_LAW - 1), -1))
     away, strength = vertices.normal - anchor.normal, sums.count / anchor.sigma**2
     for k, tangent in enumerate(tangents(vertices.normal)):
         hessian[:, k, k] += strength
@@ -196,7 +197,10 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     for start in range(0, len(hessian), VERTICES_PER_BLOCK):
         part = slice(start, start + VERTICES_PER_BLOCK)
         L = torch.linalg.cholesky(hessian[part].double())
-        cross = [*(sums.cross[rig][part].flatten(2) for rig in range(len(layout.lights))), sums.vertices[part, :-3, -3:-1]]
+        cross = [
+            *(sums.cross[rig][part].flatten(2) for rig in range(len(layout.lights))),
+            sums.vertices[part, : -OF_LAW - 1, -OF_LAW - 1 : -1],
+        ]
         coupled = (torch.cat(cross, 2) * free[part][..., None]).double()
         half = torch.linalg.solve_triangular(L, coupled, upper=False)
         right = torch.linalg.solve_triangular(L, (gradient[part] * free[part]).double()[..., None], upper=False)
@@ -233,9 +237,9 @@ def light_step(
     patches: Patches,
     rotations: list[Tensor],
     one_rig: bool,
-    free: tuple[bool, bool, bool] = (True, True, True),
+    free: tuple[bool, bool, bool, bool] = (True, True, True, True),
 ) -> tuple[list[DirectionalLights], Law]:
-    """One Gauss-Newton step of what is free of lights, grazing and bounce, with the vertices eliminated.
+    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated.
 
     rotations: camera_from_world of the views, float32.
     """
@@ -259,10 +263,11 @@ def light_step(
 
 def _stepped_law(law: Law, step: Tensor, reflected: float) -> Law:
     """The law after a step, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
-    grazing, bounce = (float(value) for value in torch.tensor([law.grazing, law.bounce], dtype=step.dtype) + step.cpu())
-    return replace(
-        law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=min(max(bounce, 0.0), 1 / max(reflected, 1e-300))
-    )
+    before = torch.tensor([law.grazing, law.bounce, law.gleam], dtype=step.dtype)
+    grazing, *others = (before + step.cpu()).tolist()
+    most = 1 / max(reflected, 1e-300)
+    bounce, gleam = (min(max(value, 0.0), most) for value in others)
+    return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=bounce, gleam=gleam)
 
 
 def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:

@@ -34,7 +34,7 @@ from mvps.joint.steps import CORRELATED
 from mvps.joint.trial import parted
 from mvps.material import Trial, judged
 from mvps.neural import MOMENTS, Layers, inputs, log_factor, moments
-from mvps.scene import Float, Law, Residual
+from mvps.scene import Float, Residual
 from solvers.adam import Adam
 
 NAME = "neural residual where the fit is poor"
@@ -79,10 +79,9 @@ class _Table(NamedTuple):
     weight: Tensor
 
 
-def _split(shaded: Shaded, law: Law) -> tuple[Tensor, Tensor]:
+def _split(shaded: Shaded) -> tuple[Tensor, Tensor]:
     """The prediction's direct part and its inter-reflection."""
-    rest = law.bounce * shaded.indirect
-    return shaded.predicted - rest, rest
+    return shaded.predicted - shaded.rest, shaded.rest
 
 
 def _sums(of: Observed, every: int, first: int) -> Tensor:
@@ -96,7 +95,7 @@ def _sums(of: Observed, every: int, first: int) -> Tensor:
             shaded = evaluate(normal, vertices.reflectance[index], towards, lights, of.law, samples.gathered_of(part))
             residual = samples.image[part] - shaded.predicted
             weight = samples.weight[part, None] * samples.data[part] * robust(residual, scale) / (CORRELATED * scale[:, None] ** 2)
-            direct, _ = _split(shaded, of.law)
+            direct, _ = _split(shaded)
             rows = torch.cat([moments(normal, towards, lights.direction) * direct[..., None], residual[..., None]], -1)
             sums.index_add_(0, index, (rows * weight[..., None]).transpose(1, 2) @ rows)
     return sums
@@ -144,7 +143,7 @@ def _table(of: Observed, views: list[ViewSamples], codes: Sequence[Tensor]) -> _
             x = inputs(normal, towards, lights.direction, codes[i % FOLDS][index])
             data, image = samples.data[part], samples.image[part]
             vertex, weight = (a[:, None].expand_as(image) for a in (index, samples.weight[part]))
-            for column, values in zip(columns, (vertex, x, *_split(shaded, of.law), image, weight), strict=True):
+            for column, values in zip(columns, (vertex, x, *_split(shaded), image, weight), strict=True):
                 column.append(values[data])
     return _Table(*(torch.cat(column) for column in columns))
 

@@ -22,9 +22,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvps.bounce import Sources, gathered, interpolation
+from mvps.bounce import interpolation
 from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
+from mvps.gleam import Senders, terms
 from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, cast_shadow, ray_caster, visible_vertices
@@ -44,8 +45,8 @@ class ViewSamples:
     """One view's samples of the n vertices it sees. All in torch; directions in the world frame.
 
     vertex (n,) index; towards (n, 3) unit vector to the camera; weight (n,) of the pair; image (n, lights) grey radiance;
-    data (n, lights) bool, False where saturated or in cast shadow; gathered (n, lights) what other surfaces send (bounce.py), None
-    where that is not asked for.
+    data (n, lights) bool, False where saturated or in cast shadow; gathered (n, lights, terms) what other surfaces send
+    (gleam.py), None where that is not asked for.
     """
 
     vertex: Tensor
@@ -166,12 +167,13 @@ def observe(
     return on_cores(one, range(len(capture.views)))
 
 
-def with_gathered(views: list[ViewSamples], surface: Surface, sources: Sources, bounce: float, lights: Lights) -> list[ViewSamples]:
-    """The samples with what other surfaces send to them, for the law's bounce and the lights."""
-    weight = interpolation(sources.of, surface.vertices, vertex_normals(surface))
+def with_gathered(views: list[ViewSamples], capture: Capture, surface: Surface, senders: Senders, lights: Lights) -> list[ViewSamples]:
+    """The samples of a capture's views with what other surfaces send to them under the lights."""
+    weight = interpolation(senders.sources.of, surface.vertices, vertex_normals(surface))
 
     def one(i: int) -> ViewSamples:
-        values = weight[views[i].vertex.cpu().numpy()] @ gathered(sources, lights.direction[i], bounce)
+        G = terms(senders, lights.direction[i], capture.views[i].camera.centre)
+        values = (weight[views[i].vertex.cpu().numpy()] @ G.reshape(len(G), -1)).reshape(-1, *G.shape[1:])
         return replace(views[i], gathered=torch.from_numpy(values).to(views[i].image.device))
 
     return on_cores(one, range(len(views)))

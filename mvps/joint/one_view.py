@@ -58,7 +58,7 @@ def refine_view(
 ) -> Refined:
     """Rounds from lights and photometric stereo of the capture's only view. integrated: the surface of normals (pixels, 3), world, with
     confidence (pixels,). settings: whose rounds are not used, one view has its own kind."""
-    model = replace(settings.model, sharpness=law.sharpness, grazing=False, bounce=False)
+    model = replace(settings.model, sharpness=law.sharpness, grazing=False, bounce=False, gleam=False)
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     state: State | None = None

@@ -6,6 +6,8 @@ of every view's own pixels (pixels.py)
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -15,9 +17,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, sources_on
+from mvps.bounce import PATCH_EDGES, Gather, gather
 from mvps.camera import pixel_footprint
 from mvps.cores import neighbours
+from mvps.gleam import Senders, senders, shiny
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
@@ -28,7 +31,7 @@ from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
-from mvps.material import Model, Trial, choose
+from mvps.material import Model, Trial, choose, judged
 from mvps.mesh import angles_deg, edges, lengths, mean_edge_length, normalise, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 
@@ -48,7 +51,8 @@ common (patches.py); ties of single normals hold lights to the mesh's errors."""
 
 @dataclass
 class State:
-    """What one round hands to the next. under: the photographs, perhaps thinned, that `views` are samples of, and their lights."""
+    """What one round hands to the next. under: the photographs, perhaps thinned, that `views` are samples of, and their lights; lobed:
+    whether lobes take part in inter-reflection (gleam.py)."""
 
     surface: Surface
     lights: Lights
@@ -57,6 +61,7 @@ class State:
     model: Model
     vertices: Vertices | None = None
     coarse: Gather | None = None
+    lobed: bool = False
     views: list[ViewSamples] = field(default_factory=list)
     under: tuple[Capture, Lights] | None = None
     trials: list[Trial] = field(default_factory=list)
@@ -123,25 +128,53 @@ def drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) 
     return drawn
 
 
-def _choose_model(
-    state: State,
-    capture: Capture,
-    few: list[ViewSamples],
-    start: Vertices,
-    anchor: Anchor,
-    patches: Patches,
-    sharpen: bool,
-) -> list[int]:
-    """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account. Which of the
-    state's lobes stay."""
+def _of_chosen_model(
+    state: State, capture: Capture, few: list[ViewSamples], start: Vertices, mesh_normal: Float, patches: Patches, sharpen: bool
+) -> Vertices:
+    """Puts the components of the reflectance model on trial; the state keeps those that earn their place, and the account. The vertices
+    with the lobes that stay."""
+    device, law = patches.vertex.device, state.law
+    tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
+    # Light by way of lobes is tried when their weights are known.
+    state.lobed = False
+    lit = _lit(state, few, capture, state.lights, _senders(state, start))
+    kept, state.trials = choose(state.model, _errors(state, capture, lit, start, tie, patches), sharpen)
+    state.model = replace(kept, gleam=state.model.gleam)
+    state.law = replace(law, sharpness=kept.sharpness, grazing=law.grazing * kept.grazing, bounce=law.bounce * kept.bounce)
+    stay = [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
+    return replace(start, reflectance=start.reflectance[:, torch.tensor([0, *(1 + k for k in stay)], device=device)])
+
+
+def _errors(
+    state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, patches: Patches
+) -> Callable[[Model], Float]:
+    """The errors on held-out samples under a model, of the vertices of the first patches."""
+    patches = patches.first(TRIAL_VERTICES // VERTICES_OF_PATCH)
     few, part, tie = subset(few, start, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
-    lights, law = grey_lights(state.lights, patches.vertex.device), state.law
-    errors = partial(held_out_errors, few, part, lights, tie, patches, rotations, law)
-    state.model, state.trials = choose(state.model, errors, sharpen)
-    kept = state.model
-    state.law = replace(law, sharpness=kept.sharpness, grazing=law.grazing * kept.grazing, bounce=law.bounce * kept.bounce)
-    return [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
+    return partial(held_out_errors, few, part, grey_lights(state.lights, patches.vertex.device), tie, patches, rotations, state.law)
+
+
+def _count_lobes(
+    state: State, capture: Capture, few: list[ViewSamples], vertices: Vertices, anchor: Anchor, patches: Patches, choosing: bool
+) -> None:
+    """Whether lobes take part in inter-reflection, for the state: where they return enough and, while the model is chosen, where that
+    predicts held-out samples better."""
+    wanted = state.model.gleam
+    state.lobed = wanted and shiny(state.law, *_reflectance(vertices))
+    name = "inter-reflection of lobes"
+    if choosing and state.lobed:
+        start = time.perf_counter()
+        lit = _lit(state, few, capture, state.lights, _senders(state, vertices))
+        errors = _errors(state, capture, lit, vertices, anchor, patches)
+        trial = judged(name, errors(replace(state.model, gleam=False)), errors(state.model))
+        state.trials.append(replace(trial, seconds=time.perf_counter() - start))
+        state.lobed = trial.kept
+    elif choosing and wanted:
+        state.trials.append(Trial(f"{name}: not tried, they return little", False, 0.0, 0.0, 0.0))
+    if choosing:
+        state.model = replace(state.model, gleam=state.lobed)
+    state.law = replace(state.law, gleam=state.law.gleam * state.lobed)
 
 
 def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest: float) -> torch.Tensor:
@@ -166,7 +199,7 @@ def _solve_lights(
     vertices: Vertices,
     anchor: Anchor,
     patches: Patches,
-    free_lights: bool,
+    free: tuple[bool, bool, bool, bool],
 ) -> tuple[Lights, float]:
     """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
 
@@ -178,7 +211,6 @@ def _solve_lights(
     few, part, tie = subset(few, vertices, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)
-    free = (free_lights, state.model.grazing, state.model.bounce)
     before = lights
     for _ in range(LIGHT_STEPS):
         before = lights
@@ -207,11 +239,23 @@ def light_change(a: Lights, b: Lights) -> tuple[float, float]:
     return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
 
 
-def _sources(state: State, vertices: Vertices) -> Sources | None:
-    """The patches that send light, with the vertices' albedo; None where inter-reflection is not modelled."""
-    if state.coarse is None or not state.model.bounce:
+def _senders(state: State, vertices: Vertices) -> Senders | None:
+    """What sends light on, by the vertices' reflectance; None where inter-reflection is not modelled."""
+    if state.coarse is None or not (state.model.bounce or state.lobed):
         return None
-    return sources_on(state.coarse, state.surface, vertices.reflectance[:, 0].double().cpu().numpy())
+    albedo, weight = _reflectance(vertices)
+    return senders(state.coarse, state.surface, state.law, albedo, weight if state.lobed else None)
+
+
+def _lit(state: State, views: list[ViewSamples], of: Capture, lights: Lights, sent: Senders | None) -> list[ViewSamples]:
+    """The samples with what other surfaces send to them."""
+    return views if sent is None else with_gathered(views, of, state.surface, sent, lights)
+
+
+def _reflectance(vertices: Vertices) -> tuple[Float, Float]:
+    """Albedo (V,) and weights (V, lobes)."""
+    values = vertices.reflectance.double().cpu().numpy()
+    return values[:, 0], values[:, 1:]
 
 
 def photometric_round(
@@ -234,24 +278,19 @@ def photometric_round(
     if state.coarse is None:
         state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
 
-    def with_sources(views: list[ViewSamples], lights: Lights, sources: Sources | None) -> list[ViewSamples]:
-        return views if sources is None else with_gathered(views, state.surface, sources, state.law.bounce, lights)
-
-    if task.choose and not state.trials:
-        tie = free_reflectance(_tensor(mesh_normal, device), LIGHT_TIE, 1)
-        tried = patches.first(TRIAL_VERTICES // VERTICES_OF_PATCH)
-        lit = with_sources(few, state.lights, _sources(state, vertices))
-        lobes = _choose_model(state, capture, lit, vertices, tie, tried, task.sharpen)
-        columns = torch.tensor([0, *(1 + k for k in lobes)], device=device)
-        vertices = replace(vertices, reflectance=vertices.reflectance[:, columns])
+    choosing = task.choose and not state.trials
+    if choosing:
+        vertices = _of_chosen_model(state, capture, few, vertices, mesh_normal, patches, task.sharpen)
     free = free_reflectance(_tensor(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights = vertices.normal, grey_lights(part_lights, device)
     vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS)
-    sources = _sources(state, vertices)
-    state.views = with_sources(state.views, part_lights, sources)
-    few = state.views if part is capture else with_sources(few, state.lights, sources)
+    _count_lobes(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), patches, choosing)
+    sent = _senders(state, vertices)
+    state.views = _lit(state, state.views, part, part_lights, sent)
+    few = state.views if part is capture else _lit(state, few, capture, state.lights, sent)
     free = with_population(vertices, free)
-    solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), patches, task.free_lights)
+    unknown = (task.free_lights, state.model.grazing, state.model.bounce, state.lobed)
+    solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), patches, unknown)
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
@@ -263,7 +302,7 @@ def photometric_round(
     state.under = thinned(capture, state.lights)
     of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))
-    state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, _sources(state, vertices), device, task.half)
+    state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, _senders(state, vertices), device, task.half)
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None
     stated = np.degrees(vertices.sigma.cpu().numpy()[seen])
@@ -277,6 +316,7 @@ def photometric_round(
         "stated_error_deg": float(np.median(stated)),
         "grazing": state.law.grazing,
         "bounce": state.law.bounce,
+        "gleam": state.law.gleam,
     }
 
 
@@ -314,4 +354,6 @@ def material_of(state: State, albedo: Float) -> Material:
     weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
     certain = confidence(vertices).double().cpu().numpy()
     certain, law = np.where(known, certain, 0), state.law
-    return Material(normal, albedo[nearest], weight, np.array(law.sharpness), certain, law.grazing, law.bounce, law.microfacet, law.shadows)
+    return Material(
+        normal, albedo[nearest], weight, np.array(law.sharpness), certain, law.grazing, law.bounce, law.microfacet, law.shadows, law.gleam
+    )

@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvps.bounce import Sources, at, gathered
+from mvps.bounce import at
 from mvps.camera import view_directions
 from mvps.cores import on_cores
+from mvps.gleam import Senders, terms
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_step
@@ -66,7 +67,7 @@ def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
 def pixel_normals(
     view: View,
     caster: RayCaster,
-    sources: Sources | None,
+    sent: Senders | None,
     material: Material,
     direction: Float,
     intensity: Float,
@@ -76,7 +77,7 @@ def pixel_normals(
 ) -> NormalMap:
     """Normals, albedo and confidence of a view's pixels; confidence 0 where a pixel misses the mesh.
 
-    sources: the surfaces that send light, None without inter-reflection; direction, intensity (lights, 3);
+    sent: what other surfaces send, None without inter-reflection; direction, intensity (lights, 3);
     quick: lights of the first steps; every_other: only `view.every_other`; confidence 0 elsewhere.
     """
     chosen = view.every_other if every_other else np.arange(len(view.pixels))
@@ -84,8 +85,8 @@ def pixel_normals(
     hit = np.flatnonzero(points.hit)
     rows, shadow = chosen[hit], shadow_at(caster, material.law, points, direction)[hit]
     samples = _samples(view, points.position[hit], shadow, intensity, rows, device)
-    if sources is not None:
-        G = at(sources, gathered(sources, direction, material.bounce), points.position[hit], points.mesh_normal[hit])
+    if sent is not None:
+        G = at(sent.sources, terms(sent, direction, view.camera.centre), points.position[hit], points.mesh_normal[hit])
         samples = replace(samples, gathered=torch.from_numpy(G).to(device))
     known = np.column_stack([points.albedo.mean(1), points.specular_weight])[hit]
     reflectance, normal, light, grey = (
@@ -127,7 +128,7 @@ def all_pixel_normals(
     surface: Surface,
     material: Material,
     lights: Lights,
-    sources: Sources | None,
+    sent: Senders | None,
     device: torch.device,
     every_other: bool = False,
 ) -> tuple[NormalMap, ...]:
@@ -135,7 +136,7 @@ def all_pixel_normals(
     caster, quick = ray_caster(surface), kept([len(view.lights) for view in capture.views])
 
     def one(i: int) -> NormalMap:
-        of_view = capture.views[i], caster, sources, material, lights.direction[i], lights.intensity[i]
+        of_view = capture.views[i], caster, sent, material, lights.direction[i], lights.intensity[i]
         return pixel_normals(*of_view, quick[i], device, every_other)
 
     return tuple(on_cores(one, range(len(capture.views))))

@@ -54,11 +54,12 @@ def held_out_errors(
     reflectance = torch.cat([start.reflectance[:, :1], start.reflectance.new_zeros(len(start.normal), unknowns - 1)], 1)
     state = Vertices(start.normal, reflectance, start.scale)
     free = replace(anchor, reflectance=torch.zeros_like(reflectance), reflectance_sigma=torch.full_like(reflectance, torch.inf))
-    law = replace(law, sharpness=model.sharpness, grazing=0.0, bounce=0.0)
+    law = replace(law, sharpness=model.sharpness, grazing=0.0, bounce=0.0, gleam=0.0)
     for _ in range(VERTEX_STEPS):
         state = vertex_step(fitted, state, lights, law, free, patches=patches)
-    for _ in range(LAW_STEPS if model.grazing or model.bounce else 0):
-        _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, (False, model.grazing, model.bounce))
+    law_free = (model.grazing, model.bounce, model.gleam)
+    for _ in range(LAW_STEPS if any(law_free) else 0):
+        _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, (False, *law_free))
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
     error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)

@@ -29,14 +29,14 @@ def rendered(
     surface: Surface, material: Material, lights: Mapping[Photograph, Light], capture: Capture
 ) -> Iterator[tuple[View, list[int], NDArray[np.float32]]]:
     """View by view: the view, the positions of its photographs that `lights` names, and their rendering (pixels, positions, 3)."""
-    from mvps.rendering import light_arriving, light_sources, photograph
+    from mvps.rendering import light_arriving, light_senders, photograph
 
-    caster, sources = ray_caster(surface), light_sources(surface, material)
+    caster, senders = ray_caster(surface), light_senders(surface, material)
     for view in capture.views:
         kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]
         if kept:
             direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
-            arriving = light_arriving(sources, material, direction)
+            arriving = light_arriving(senders, direction, view.camera.centre)
             yield view, kept, photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)
 
 

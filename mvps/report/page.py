@@ -11,7 +11,7 @@ from typing import Any
 
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.cores import on_cores
-from mvps.rendering import light_sources
+from mvps.rendering import light_senders
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
 from mvps.scene import Capture, Reconstruction, View
@@ -185,9 +185,9 @@ def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
     views = _known_views(reconstruction, capture)
     if not views:
         return ""
-    caster, sources = ray_caster(reconstruction.surface), light_sources(reconstruction.surface, reconstruction.material)
+    caster, senders = ray_caster(reconstruction.surface), light_senders(reconstruction.surface, reconstruction.material)
     parts = []
-    shown = on_cores(lambda view: view_pictures(caster, sources, reconstruction, view), views)
+    shown = on_cores(lambda view: view_pictures(caster, senders, reconstruction, view), views)
     for view, (light, pictures) in zip(views, shown, strict=True):
         figures = "".join(
             f'<figure><img src="{data_address(p.image)}" width="{p.image.shape[1]}" height="{p.image.shape[0]}"'

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvps.bounce import Sources
 from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.gleam import Senders
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.rendering import light_arriving, photograph, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View, expected_error_deg
@@ -34,7 +34,7 @@ class Picture(NamedTuple):
     text: str
 
 
-def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Reconstruction, view: View) -> tuple[str, list[Picture]]:
+def view_pictures(caster: RayCaster, senders: Senders | None, reconstruction: Reconstruction, view: View) -> tuple[str, list[Picture]]:
     """The light shown ("light 3") and the pictures of a view that the result holds."""
     place = reconstruction.views.index(view.name)
     shared = [k for k, number in enumerate(view.lights) if number in reconstruction.light_names[place]]
@@ -46,7 +46,7 @@ def view_pictures(caster: RayCaster, sources: Sources | None, reconstruction: Re
     direction, intensity = (values[place][row : row + 1] for values in (reconstruction.lights.direction, reconstruction.lights.intensity))
     material = reconstruction.material
     measured = view.radiance([chosen])[:, 0]
-    arriving = light_arriving(sources, material, direction)
+    arriving = light_arriving(senders, direction, view.camera.centre)
     rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)[:, 0]
     dark = replace(material, albedo=np.zeros_like(material.albedo))
     specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity)[:, 0]

@@ -61,7 +61,7 @@
         float s = sharpness[k], lobe = exp(s * (hn - 1.0)), spread = 1.0 + s / 4.0 * (1.0 - hn * hn);
         sum += w[k] * w[k] * lobeWhite[k] * tint[k] * (microfacet ? 1.0 / (spread * spread) : lobe);
       }
-      return sum;
+      return sum * min(2.0 / max(1.0 + dot(v, l), 1e-6), 4.0);
     }
     vec3 lit(vec3 body, vec4 w, vec3 N, vec3 v, vec3 l) {
       vec3 matte = layer == 2 ? vec3(0.0) : body * D(dot(N, l)) * D(dot(N, v));

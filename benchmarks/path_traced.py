@@ -1,0 +1,85 @@
+"""What the program makes of captures by another renderer: shapes, materials and light between surfaces as Mitsuba 3 traces them.
+
+    python benchmarks/path_traced.py [CASE ...] [--preset standard] [--keep DIR]
+
+Cases are those of CASES, all of them if none is named. Each is made (benchmarks/hard/traced.py), reconstructed and evaluated through the
+command line. Writes path_traced.json and path_traced.md beside this file, after every case; cases of earlier runs stay. --keep DIR keeps
+DIR/CASE/given and DIR/CASE/result. Needs pip install mvps[mitsuba].
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from accuracy import COLUMNS, HERE, machine, machines, table
+from hard.cases import Sample
+from hard.scenes import rendered, shaped_as
+from hard.traced import BOUNCES, SHAPES, surface_of, traced
+from hard_cases import run_one
+
+from mvps.synthetic.settings import SceneSettings
+
+SHOWN = [column for column in COLUMNS if column[0] not in ("F@0.5 mm", "Chamfer mm", "held-out PSNR dB", "runs")]
+
+
+class Case(NamedTuple):
+    """shape and material of hard/traced.py; settings of the photographs; direct: without light between surfaces."""
+
+    shape: str
+    material: str
+    settings: SceneSettings = SceneSettings()
+    direct: bool = False
+
+
+CASES = {
+    "statue-copper": Case("statue", "copper", SceneSettings(seed=1)),
+    "statue-copper-direct": Case("statue", "copper", SceneSettings(seed=1), direct=True),
+    "vessel-copper": Case("vessel", "copper", SceneSettings(seed=2)),
+    "knot-gold": Case("knot", "gold", SceneSettings(seed=3)),
+    "vessel-lacquer": Case("vessel", "lacquer", SceneSettings(seed=4)),
+    "coral-patina": Case("coral", "patina", SceneSettings(seed=5)),
+    "shell-plastic": Case("shell", "plastic", SceneSettings(seed=6, free_lights=True)),
+    "statue-dark": Case("statue", "dark", SceneSettings(seed=7)),
+    "coral-cloth": Case("coral", "cloth", SceneSettings(seed=8, views=6, lights=8)),
+    "knot-plastic": Case("knot", "plastic", SceneSettings(seed=9)),
+}
+
+
+def made(case: Case) -> Sample:
+    """The capture and its truth."""
+    surface = surface_of(SHAPES[case.shape]())
+    scene = shaped_as(surface, case.settings)
+    take = traced(scene.surface, case.material, 2 if case.direct else BOUNCES)
+    capture, truth = rendered(case.settings, lambda _: scene, take)
+    return Sample(capture, capture, truth)
+
+
+def main() -> None:
+    """The command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", help=" ".join(CASES))
+    parser.add_argument("--preset", default="standard")
+    parser.add_argument("--limit", type=float, default=600.0, metavar="S", help="seconds after which a command counts as hanging")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and results")
+    given = parser.parse_args()
+    unknown = [name for name in given.cases if name not in CASES]
+    if unknown:
+        parser.error(f"wanted cases among {' '.join(CASES)}, given {' '.join(unknown)}")
+    stem = HERE / ("path_traced" if given.preset == "standard" else f"path_traced-{given.preset}")
+    before = json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"] if stem.with_suffix(".json").exists() else []
+    found = {row["case"]: row for row in before}
+    for name in given.cases or CASES:
+        row = run_one(name, made(CASES[name]), given.preset, given.limit, given.keep)
+        found[name] = row | {"machine": machine("cpu")}
+        rows = [found[name] for name in CASES if name in found]
+        stem.with_suffix(".json").write_text(json.dumps({"rows": rows}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        command = f"python {Path(sys.argv[0]).parent.name}/path_traced.py --preset {given.preset}"
+        stem.with_suffix(".md").write_text(f"`{command}` on {machines(rows)}.\n\n{table(rows, SHOWN)}\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

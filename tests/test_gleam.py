@@ -1,0 +1,174 @@
+"""Inter-reflection by way of lobes: what holds for any lobe, and a lobe as wide as the hemisphere, which is a diffuse surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from mvps.bounce import gathered
+from mvps.gleam import coarse_senders, shiny, terms
+from mvps.mesh import vertex_normals
+from mvps.rendering import light_arriving, photograph, points_under
+from mvps.scene import Camera, Law, Material, Surface, View
+from mvps.shading import STEEPEST, returned
+from mvps.texture import pixel_albedo
+from mvps.visibility import ray_caster
+
+WIDE = 1e-6
+"""Sharpness of a lobe that is one everywhere."""
+
+EYE = np.array([40.0, 30.0, 60.0])
+LIGHTS = np.array([[0.3, 0.2, 0.93], [0.6, -0.5, 0.62]])
+LIGHTS /= np.linalg.norm(LIGHTS, axis=1, keepdims=True)
+
+
+def corner() -> Surface:
+    """Two plates at a right angle, lit from above and from one side."""
+    plates = []
+    for turn in (0.0, np.pi / 2):
+        plate = trimesh.creation.box((20, 20, 0.5))
+        for _ in range(4):
+            plate = plate.subdivide()
+        plate.apply_translation([10.3, 0, 0])
+        plate.apply_transform(trimesh.transformations.rotation_matrix(-turn, [0, 1, 0]))
+        plates.append(plate)
+    both = trimesh.util.concatenate(plates)
+    return Surface(np.array(both.vertices), np.array(both.faces))
+
+
+def made_of(surface: Surface, albedo: float, weights: tuple[float, ...], sharpness: tuple[float, ...], **law: float) -> Material:
+    count = len(surface.vertices)
+    grey = np.full((count, 3), albedo)
+    of_lobes = np.tile(weights, (count, 1)), np.array(sharpness)
+    return Material(vertex_normals(surface), grey, *of_lobes, np.ones(count), **law)  # type: ignore[arg-type]
+
+
+def looking_at_origin() -> Camera:
+    """A camera at EYE."""
+    forward = -EYE / np.linalg.norm(EYE)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(np.array([[150.0, 0, 32], [0, 150, 32], [0, 0, 1]]), rotation, -rotation @ EYE, 64, 64)
+
+
+@pytest.fixture
+def ungained(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Lobes without what microfacets gain where light and view part."""
+    with monkeypatch.context() as patch:
+        patch.setattr("mvps.shading.STEEPEST", 1.0)
+        returned.cache_clear()
+        yield
+    returned.cache_clear()
+
+
+@pytest.mark.usefixtures("ungained")
+def test_a_lobe_as_wide_as_the_hemisphere_sends_and_takes_what_a_diffuse_surface_does() -> None:
+    surface = corner()
+    diffuse = coarse_senders(surface, made_of(surface, 0.5, (), (), bounce=0.8), grey=True)
+    lobed = coarse_senders(surface, made_of(surface, 0.0, (0.5,), (WIDE,), gleam=0.8), grey=True)
+    assert diffuse is not None and lobed is not None
+    G, by_lobes = terms(diffuse, LIGHTS, EYE), terms(lobed, LIGHTS, EYE)
+    assert G.shape[2] == 1 and by_lobes.shape[2] == 3 and G.max() > 0.05
+    assert np.abs(by_lobes[:, :, 0]).max() == 0
+    for k in (1, 2):
+        assert np.allclose(by_lobes[:, :, k], G[:, :, 0], atol=1e-5)
+
+
+@pytest.mark.usefixtures("ungained")
+def test_albedo_and_lobes_share_what_is_sent() -> None:
+    """Half of the reflectance as albedo, half as a lobe: all together is what it was; the part of albedo alone has only its own bounces."""
+    surface = corner()
+    whole = coarse_senders(surface, made_of(surface, 0.5, (), (), bounce=0.8), grey=True)
+    halves = coarse_senders(surface, made_of(surface, 0.25, (0.25,), (WIDE,), bounce=0.8, gleam=0.8), grey=True)
+    assert whole is not None and halves is not None
+    G, parts = terms(whole, LIGHTS, EYE)[:, :, 0], terms(halves, LIGHTS, EYE)
+    assert np.allclose(parts[:, :, 0] + parts[:, :, 1], G, atol=1e-5) and np.allclose(parts[:, :, 2], G, atol=1e-5)
+    assert np.allclose(parts[:, :, 0], gathered(halves.sources, LIGHTS, 0.8))
+
+
+@pytest.mark.usefixtures("ungained")
+def test_photographs_and_textures_of_a_wide_lobe_are_those_of_a_diffuse_surface() -> None:
+    surface = corner()
+    matt, lobed = made_of(surface, 0.5, (), (), bounce=0.8), made_of(surface, 0.0, (0.5,), (WIDE,), gleam=0.8)
+    camera = looking_at_origin()
+    caster, pixels = ray_caster(surface), np.argwhere(np.ones((64, 64), bool))
+    both = []
+    for material in (matt, lobed):
+        arriving = light_arriving(coarse_senders(surface, material), LIGHTS, camera.centre)
+        both.append(photograph(caster, material, camera, pixels, LIGHTS, np.ones((2, 3)), arriving))
+        plain = photograph(caster, material, camera, pixels, LIGHTS, np.ones((2, 3)))
+        assert (both[-1] - plain).max() > 0.02
+    assert np.allclose(*both, atol=1e-5) and both[0].max() > 0.1
+
+
+def test_a_body_without_hollows_sends_itself_nothing() -> None:
+    made = trimesh.creation.icosphere(subdivisions=3, radius=10.0)
+    surface = Surface(np.array(made.vertices), np.array(made.faces))
+    sent = coarse_senders(surface, made_of(surface, 0.1, (0.5, 0.3), (10.0, 90.0), bounce=1.0, gleam=1.0))
+    assert sent is not None
+    assert np.abs(terms(sent, LIGHTS, EYE)).max() == 0
+
+
+def test_sharp_lobes_send_to_the_mirror_direction() -> None:
+    """Light that comes down on the floor at 45 degrees, away from the wall or towards it: mirrors send to the wall only the latter."""
+    surface = corner()
+    sent = coarse_senders(surface, made_of(surface, 0.0, (1.0,), (60.0,), gleam=1.0), grey=True)
+    assert sent is not None
+    of = sent.sources.of
+    wall = (of.normal[:, 0] > 0.9) & (of.caster.surface.vertices[of.vertex, 2] > 2)
+    # Along the wall's own plane and away from the wall: neither lights the wall itself.
+    lights = np.array([[1.0, 0, 1], [-1e-3, 0, 1]]) / np.sqrt([[2.0], [1.0]])
+    G = terms(sent, lights, EYE)[wall, :, 1]
+    assert G[:, 0].mean() > 3 * G[:, 1].mean() > 0
+
+
+def test_the_gain_at_grazing_angles_is_bounded() -> None:
+    surface = corner()
+    material = made_of(surface, 0.0, (1.0,), (WIDE,), gleam=1e-9)
+    sent = coarse_senders(surface, material, grey=True)
+    plain = coarse_senders(surface, made_of(surface, 1.0, (), (), bounce=1e-9), grey=True)
+    assert sent is not None and plain is not None
+    once, twice = terms(sent, LIGHTS, EYE)[:, :, 1], terms(plain, LIGHTS, EYE)[:, :, 0]
+    once, twice = once[twice > 0.01], twice[twice > 0.01]
+    assert (once >= 0.999 * twice).all() and (once <= 1.001 * STEEPEST * twice).all() and once.mean() > 1.2 * twice.mean()
+
+
+def test_lobes_count_where_they_return_a_quarter() -> None:
+    law, albedo = Law((WIDE,)), np.full(5, 0.75)
+    quarter = np.full((5, 1), 0.25 / returned(law.sharpness, False)[1])
+    assert shiny(law, albedo, 1.01 * quarter) and not shiny(law, albedo, 0.99 * quarter)
+    assert not shiny(Law(()), albedo, np.zeros((5, 0)))
+    assert not shiny(law, np.zeros(5), np.zeros((5, 1)))
+
+
+def test_colours_of_lobes_are_sent_channel_by_channel() -> None:
+    surface = corner()
+    material = made_of(surface, 0.0, (0.4,), (20.0,), gleam=1e-9)
+    tinted = replace(material, specular_weight=material.specular_weight[..., None] * (1.0, 0.5, 0.25))
+    sent = coarse_senders(surface, tinted)
+    assert sent is not None
+    G = terms(sent, LIGHTS, EYE)
+    assert G.shape[-1] == 3 and np.allclose(G[..., 1], G[..., 0] / 2, atol=1e-6) and np.allclose(G[..., 2], G[..., 0] / 4, atol=1e-6)
+
+
+def test_albedo_of_texels_is_what_lobes_leave() -> None:
+    """A photograph with light by way of lobes: the albedo comes back only where that light is taken off."""
+    surface = corner()
+    material = made_of(surface, 0.3, (0.4,), (20.0,), bounce=0.5, gleam=0.8)
+    camera = looking_at_origin()
+    caster = ray_caster(surface)
+    arriving = light_arriving(coarse_senders(surface, material), LIGHTS, camera.centre)
+    every = np.argwhere(np.ones((64, 64), bool))
+    mask = points_under(caster, material, camera, every).hit.reshape(64, 64)
+    image = photograph(caster, material, camera, np.argwhere(mask), LIGHTS, np.ones((2, 3)), arriving)
+    scale = float(image.max()) / 60000
+    view = View("view_01", camera, mask, np.rint(image / scale).astype(np.uint16), scale, 65535, (1, 2))
+    for given, near in ((arriving, True), (None, False)):
+        _, albedo, known = pixel_albedo(caster, material, view, LIGHTS, np.ones((2, 3)), given)
+        error = np.abs(albedo[known] - 0.3).max()
+        assert (error < 1e-3) == near
