@@ -8,7 +8,7 @@ Vectors  normal, light and view are unit, world frame, and point away from the s
 Light    radiance is linear; a light's intensity is its irradiance at normal incidence over the (unknown) exposure, so
 
              radiance = intensity * reflectance * max(normal . light, 0) * visibility,
-             reflectance = albedo + sum_k specular_weight_k * exp(sharpness_k * (half . normal - 1)),
+             reflectance = albedo + sum_k specular_weight_k * exp(sharpness_k * (half . normal - 1)),    (more of it in shading.py)
 
          with albedo the diffuse reflectance without its 1/pi. Only the product intensity * reflectance is observable:
          intensities are relative and normalised to a mean of one over all lights and channels.

@@ -24,6 +24,7 @@ from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.mesh import normalise
 from mvps.scene import Capture, Float, Int, Lights, Surface
+from mvps.shading import gain_of
 from mvps.visibility import cast_shadow, ray_caster
 from solvers.least_squares import bounded_step
 
@@ -190,7 +191,9 @@ def _error(samples: list[Samples], weight: Float, tables: Float) -> float:
 def _projected(tables: Float, counts: Array) -> tuple[Float, Float]:
     """Constants (K,) and weights of the lobes (K, lobes) nearest to the tables (K, entries)."""
     cosine = np.repeat(np.cos(_half_angles()), DIFFERENCE_BINS)
-    basis = np.stack([np.ones_like(cosine), *(np.exp(s * (cosine - 1)) for s in SHARPNESS)], 1)
+    to_light = np.cos(np.pi / 2 * (np.arange(DIFFERENCE_BINS) + 0.5) / DIFFERENCE_BINS)
+    gained = np.tile(gain_of((2 * to_light).astype(np.float32)), HALF_BINS)
+    basis = np.stack([np.ones_like(cosine), *(gained * np.exp(s * (cosine - 1)) for s in SHARPNESS)], 1)
     root = np.sqrt(counts)
     solved = np.stack([nnls(basis * root[:, None], table * root)[0] for table in tables])
     return solved[:, 0], solved[:, 1:]

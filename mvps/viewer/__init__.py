@@ -2,7 +2,7 @@
 
 The browser's graphics processor evaluates the same image model (shading.py) for every pixel,
 
-    radiance = sum over lights of  E * visibility * (albedo D(n . l) D(n . v) + sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0),
+    radiance = sum over lights of  E visibility (albedo D(n . l) D(n . v) + gain sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0),
 
 with normal, albedo and weights interpolated between vertices. Visibility comes from who shows the page: exactly, traced by Embree for every
 vertex (mvps.view), or from a picture of depths as each light sees them (a page without a server). An environment, which only mvps.view has,
