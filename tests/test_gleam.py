@@ -7,16 +7,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from numpy.typing import NDArray
 
 from mvps.bounce import gathered
 from mvps.gleam import coarse_senders, shiny, terms
-from mvps.mesh import vertex_normals
+from mvps.joint.refine import refine
+from mvps.material import LARGEST
+from mvps.mesh import angles_deg, normalise, vertex_normals
+from mvps.plan import Parts, last_pass
 from mvps.rendering import light_arriving, photograph, points_under
-from mvps.scene import Camera, Law, Material, Surface, View
+from mvps.scene import Camera, Capture, Float, Int, Law, Lights, Material, NormalMap, Surface, Truth, View
 from mvps.shading import STEEPEST, returned
+from mvps.synthetic.scene import make_scene, render_capture
+from mvps.synthetic.settings import SceneSettings
 from mvps.texture import pixel_albedo
-from mvps.visibility import ray_caster
+from mvps.visibility import RayCaster, ray_caster
 
 WIDE = 1e-6
 """Sharpness of a lobe that is one everywhere."""
@@ -172,3 +179,41 @@ def test_albedo_of_texels_is_what_lobes_leave() -> None:
         _, albedo, known = pixel_albedo(caster, material, view, LIGHTS, np.ones((2, 3)), given)
         error = np.abs(albedo[known] - 0.3).max()
         assert (error < 1e-3) == near
+
+
+def metal(settings: SceneSettings) -> tuple[Capture, Truth, float]:
+    """A made object of lobes alone, in the light that these send each other; and how strong that is."""
+    scene = make_scene(settings)
+    count, sharpness = len(scene.surface.vertices), np.array([10.0, 40.0])
+    weight = np.tile([0.5, 0.8], (count, 1))
+    # So that every point returns nine tenths of what it receives.
+    strength = 0.9 / float(weight[0] @ returned(tuple(sharpness), False)[1:])
+    material = replace(scene.material, albedo=np.zeros((count, 3)), specular_weight=weight, sharpness=sharpness, gleam=strength)
+    sent = coarse_senders(scene.surface, material)
+
+    def take(caster: RayCaster, _: Material, camera: Camera, pixels: Int, direction: Float, intensity: Float) -> NDArray[np.float32]:
+        return photograph(caster, material, camera, pixels, direction, intensity, light_arriving(sent, direction, camera.centre))
+
+    return *render_capture(settings, replace(scene, material=material), take), material.gleam
+
+
+def test_light_between_metals_is_found_and_normals_are_better_with_it() -> None:
+    """On the true surface, from true lights and normals."""
+    capture, truth, strength = metal(SceneSettings(views=6, lights=10, size=80))
+    lights = Lights(tuple(truth.direction.values()), tuple(truth.intensity.values()), True)
+    normals = [truth.normals[view.name][view.mask].astype(float) for view in capture.views]
+    maps = tuple(NormalMap(normalise(n), np.full((len(n), 3), 0.1), np.ones(len(n))) for n in normals)  # type: ignore[arg-type]
+    errors = []
+    for model in (LARGEST, replace(LARGEST, gleam=False)):
+        parts = Parts(model, moves=False)
+        plan = parts.of(last_pass("standard", True, False))
+        assert truth.surface is not None
+        refined = refine(capture, truth.surface, lights, maps, parts.law(), plan, 0, torch.device("cpu"), lambda *_: None)
+        errors.append(np.mean([angles_deg(true, found.normal).mean() for true, found in zip(normals, refined.maps, strict=True)]))
+        kept = [trial.kept for trial in refined.trials if trial.name == "inter-reflection of lobes"]
+        assert kept == [True] * model.gleam
+        if model.gleam:
+            assert strength / 2 < refined.law.gleam < 1.2 * strength
+        else:
+            assert refined.law.gleam == 0
+    assert errors[0] < 0.97 * errors[1]
