@@ -19,6 +19,7 @@ import json
 import shutil
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,13 @@ def honesty(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
+def where(rows: Sequence[Row]) -> str:
+    """The machine of most rows, and others with theirs."""
+    most, *others = (name for name, _ in Counter(row["machine"] for row in rows).most_common())
+    named = (f"{other} ({', '.join(row['case'] for row in rows if row['machine'] == other)})" for other in others)
+    return "; ".join([most, *named])
+
+
 def in_words(row: Row) -> str:
     """A row of a list."""
     what = f" ({row['what']})" if "what" in row else ""
@@ -113,7 +121,7 @@ def page(record: dict[str, Any]) -> str:
     command = "python benchmarks/hard_cases.py"
     parts = [
         "# Hard cases",
-        f"`{command}`, preset {record['preset']}, on {record['machine']}; s of the processor, all cores together. The made object,"
+        f"`{command}`, preset {record['preset']}, on {where(rows)}; s of the processor, all cores together. The made object,"
         f" {BASE.views} views x {BASE.lights} lights x {BASE.size} x {BASE.size} pixels, with one thing changed (`benchmarks/hard/`)."
         " Errors are against the truth before the change, seen by the cameras and masks before it.",
     ]
@@ -148,7 +156,7 @@ def run_one(name: str, sample: Sample, preset: str, limit: float, kept: Path | N
     with tempfile.TemporaryDirectory() as scratch:
         folder = (kept or Path(scratch)) / name
         shutil.rmtree(folder, ignore_errors=True)
-        row = {"case": name} | measured(sample, folder, preset, limit)
+        row = {"case": name, "machine": machine("cpu")} | measured(sample, folder, preset, limit)
     print(
         f"{name}: {row['status']}, {row['processor_seconds']:.0f} s", *(f"{row[k]:.2f}" for _, k, _, _ in FIGURES if k in row), flush=True
     )
@@ -169,7 +177,7 @@ def main() -> None:
         parser.error(f"wanted cases among {' '.join(CASES)}, given {' '.join(unknown)}")
     path = RECORD if given.preset == "standard" else RECORD.with_name(f"hard_cases-{given.preset}.json")
     record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"rows": [], "random": []}
-    record |= {"machine": machine("cpu"), "preset": given.preset}
+    record |= {"preset": given.preset}
     for name in given.cases or ([] if given.honesty else CASES):
         found = {row["case"]: row for row in record["rows"]} | {
             name: run_one(name, CASES[name].make(), given.preset, given.limit, given.keep)

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-from accuracy import COLUMNS, HERE, machine, machines, table
+from accuracy import COLUMNS, HERE, machines, table
 from hard.cases import Sample
 from hard.scenes import rendered, shaped_as
 from hard.traced import BOUNCES, SHAPES, surface_of, traced
@@ -73,8 +73,7 @@ def main() -> None:
     before = json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"] if stem.with_suffix(".json").exists() else []
     found = {row["case"]: row for row in before}
     for name in given.cases or CASES:
-        row = run_one(name, made(CASES[name]), given.preset, given.limit, given.keep)
-        found[name] = row | {"machine": machine("cpu")}
+        found[name] = run_one(name, made(CASES[name]), given.preset, given.limit, given.keep)
         rows = [found[name] for name in CASES if name in found]
         stem.with_suffix(".json").write_text(json.dumps({"rows": rows}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
         command = f"python {Path(sys.argv[0]).parent.name}/path_traced.py --preset {given.preset}"
