@@ -23,7 +23,7 @@ from hard_cases import run_one
 
 from mvps.synthetic.settings import SceneSettings
 
-SHOWN = [column for column in COLUMNS if column[0] not in ("F@0.5 mm", "Chamfer mm", "held-out PSNR dB", "runs")]
+SHOWN = [column for column in COLUMNS if column[0] not in ("F@0.5 mm", "Chamfer mm", "held-out PSNR dB", "runs", "peak MB")]
 
 
 class Case(NamedTuple):
