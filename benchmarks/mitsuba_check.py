@@ -138,7 +138,8 @@ def row(folder: Path, capture: Path, pictures: Path | None) -> list[str]:
     part = np.mean([pair.lit.sum() / pair.inside.sum() for pair in found])
     against = [mean("mitsuba", "ours"), mean("mitsuba", "direct"), f"{mean('mitsuba', 'direct', 'lit')} ({100 * part:.0f} %)"]
     photographed = [mean("ours", "photograph"), mean("mitsuba", "photograph")]
-    rest = [f"{100 * lobes:.1f}" if result.material.specular_weight.any() else "-", f"{100 * whole:.1f}", f"{tangent_gap_deg(model).mean():.2f}"]
+    of_lobes = f"{100 * lobes:.1f}" if result.material.specular_weight.any() else "-"
+    rest = [of_lobes, f"{100 * whole:.1f}", f"{tangent_gap_deg(model).mean():.2f}"]
     return [folder.name, str(len(model.faces)), str(len(found)), *against, *photographed, *rest]
 
 
