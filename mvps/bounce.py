@@ -117,19 +117,28 @@ def _around(normal: Float, directions: Float) -> Float:
     return turned
 
 
+def lit_by(of: Gather, direction: Float) -> NDArray[np.float32]:
+    """(n, lights) max(n.l, 0) * shadow of the patches."""
+    shadow = cast_shadow(of.caster, of.vertex, direction)
+    lit: NDArray[np.float32] = (np.maximum(of.normal @ direction.T, 0) * ~shadow).astype(np.float32)
+    return lit
+
+
+def series(S: sp.csr_matrix, direct: NDArray[np.float32], again: NDArray[np.float32], bounces: int) -> NDArray[np.float32]:
+    """(n, lights) S (direct + again S (direct + ...)) after so many bounces, for direct (n, lights) and again (n, 1)."""
+    G: NDArray[np.float32] = S @ direct
+    for _ in range(bounces - 1):
+        G = S @ (direct + again * G)
+    return G
+
+
 def gathered(sources: Sources, direction: Float, bounce: float) -> NDArray[np.float32]:
     """G (n, lights) or (n, lights, channels) on the patches under lights direction (lights, 3)."""
-    of = sources.of
-    shadow = cast_shadow(of.caster, of.vertex, direction)
-    lit = (np.maximum(of.normal @ direction.T, 0) * ~shadow).astype(np.float32)
+    lit = lit_by(sources.of, direction)
 
     def of_channel(albedo: Float) -> NDArray[np.float32]:
         direct = lit * albedo.astype(np.float32)[:, None]
-        again = (bounce * albedo[:, None]).astype(np.float32)
-        G: NDArray[np.float32] = of.S @ direct
-        for _ in range(BOUNCES - 1):
-            G = of.S @ (direct + again * G)
-        return G
+        return series(sources.of.S, direct, (bounce * albedo[:, None]).astype(np.float32), BOUNCES)
 
     if sources.albedo.ndim == 1:
         return of_channel(sources.albedo)

@@ -95,7 +95,9 @@ def read_reconstruction(folder: Path) -> Reconstruction:
         check_account(metrics, settings)
         check_npz(folder / "material.npz")
         with np.load(folder / "material.npz", allow_pickle=False) as arrays:
-            values = {name: arrays[name] for name in _MATERIAL} | {name: kind(arrays[name]) for name, kind in _OF_ALL.items()}
+            # A result without gleam is one whose lobes send each other nothing.
+            of_all = {name: kind(arrays[name]) for name, kind in _OF_ALL.items() if name in arrays or name != "gleam"}
+            values = {name: arrays[name] for name in _MATERIAL} | of_all
             material = Material(normal=mesh.normals, **values, residual=_residual(arrays))
         return Reconstruction(
             surface=Surface(mesh.vertices, mesh.faces),

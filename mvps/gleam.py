@@ -30,15 +30,14 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mvps.bounce import BOUNCES, PATCH_EDGES, RAYS, Gather, Sources, gather, gathered, sources_on
+from mvps.bounce import BOUNCES, PATCH_EDGES, RAYS, Gather, Sources, gather, gathered, lit_by, series, sources_on
 from mvps.mesh import mean_edge_length, normalise
 from mvps.scene import Float, Law, Material, Surface
 from mvps.shading import PARALLEL, gain_of, lobe_of, returned
-from mvps.visibility import cast_shadow
 
 LEAST_SHARE = 0.25
-"""Of the light that the median point returns, what lobes must return to be counted: less disappears in the error of what a patch gathers
-(bounce.RAYS). Glossy paint and plastic return 5 to 20 % by their lobes, metals and half-bare ones 45 to 90 (docs/method.md)."""
+"""Of the light that the median point returns, what lobes must return to be counted: as much as a patch errs in what it gathers
+(bounce.RAYS). It lies in the gap between glossy paint and plastic, 5 to 20 %, and metals and half-bare ones, 45 to 90 (docs/method.md)."""
 
 SAMPLES_PER_CHUNK = 1 << 19
 """Rays times lights at once."""
@@ -93,7 +92,7 @@ def terms(of: Senders, direction: Float, eye: Float) -> Single:
     a = (albedo if coloured else albedo[:, None]).astype(np.float32)
     w = of.weight if of.weight.ndim == 3 else of.weight[..., None]
     w = np.broadcast_to(w, (*w.shape[:2], a.shape[1])).astype(np.float32)
-    lit = (np.maximum(net.normal @ direction.T, 0) * ~cast_shadow(net.caster, net.vertex, direction)).astype(np.float32)
+    lit = lit_by(net, direction)
     later = _later(net, law, a, w, lit)
     G = np.zeros((len(a), len(direction), 2 + w.shape[1], a.shape[1]), np.float32)
     diffuse = gathered(of.sources, direction, law.bounce)
@@ -110,14 +109,11 @@ def terms(of: Senders, direction: Float, eye: Float) -> Single:
 
 def _later(net: Gather, law: Law, a: Single, w: Single, lit: Single) -> Single:
     """R A (n, lights, channels)."""
-    share = returned(law.sharpness, law.microfacet)[1:, None].astype(np.float32)
-    of_lobes = (w * share).sum(1)
+    of_lobes = (w * returned(law.sharpness, law.microfacet)[1:, None].astype(np.float32)).sum(1)
     again = (law.bounce * a + law.gleam * of_lobes).astype(np.float32)
-    first = lit[..., None] * (a + of_lobes)[:, None]
-    A = np.zeros_like(first)
-    for _ in range(BOUNCES - 1):
-        A = (net.S @ (first + again[:, None] * A).reshape(len(a), -1)).reshape(first.shape)
-    later: Single = again[:, None] * A
+    first = (a + of_lobes).T[..., None]
+    arriving = [series(net.S, lit * direct, R[:, None], BOUNCES - 1) for direct, R in zip(first, again.T, strict=True)]
+    later: Single = again[:, None] * np.stack(arriving, -1)
     return later
 
 

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 from numpy.typing import NDArray
+from sphere_scene import make_sphere
 
 from mvps.bounce import gathered
+from mvps.export import read_reconstruction, write_reconstruction
 from mvps.gleam import coarse_senders, shiny, terms
 from mvps.joint.refine import refine
 from mvps.material import LARGEST
 from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.plan import Parts, last_pass
 from mvps.rendering import light_arriving, photograph, points_under
-from mvps.scene import Camera, Capture, Float, Int, Law, Lights, Material, NormalMap, Surface, Truth, View
+from mvps.scene import Camera, Capture, CaptureError, Float, Int, Law, Lights, Material, NormalMap, Surface, Truth, View
 from mvps.shading import STEEPEST, returned
 from mvps.synthetic.scene import make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
-from mvps.texture import pixel_albedo
+from mvps.texture import bake, pixel_albedo
 from mvps.visibility import RayCaster, ray_caster
 
 WIDE = 1e-6
@@ -217,3 +220,20 @@ def test_light_between_metals_is_found_and_normals_are_better_with_it() -> None:
         else:
             assert refined.law.gleam == 0
     assert errors[0] < 0.97 * errors[1]
+
+
+def test_a_result_without_gleam_is_one_whose_lobes_send_each_other_nothing(tmp_path: Path) -> None:
+    """The other values of the whole object must be there."""
+    scene = make_sphere(subdivisions=2)
+    r = scene.reconstruction
+    write_reconstruction(r, tmp_path / "result", bake(r.surface, r.material, r.lights, scene.capture, 1)[0])
+    path = tmp_path / "result" / "material.npz"
+    with np.load(path) as arrays:
+        kept = dict(arrays)
+    del kept["gleam"]
+    np.savez(path, **kept)
+    assert read_reconstruction(tmp_path / "result").material.gleam == 0
+    del kept["bounce"]
+    np.savez(path, **kept)
+    with pytest.raises(CaptureError, match="bounce"):
+        read_reconstruction(tmp_path / "result")

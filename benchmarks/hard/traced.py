@@ -2,11 +2,11 @@
 
 Shapes are zero sets of functions f of x in the unit ball, negative inside; s(f, g) = -b log(exp(-f / b) + exp(-g / b)) melts two into one.
 
-    statue    a body of an upright ellipsoid, a head and a plinth, with folds: radius times 1 + a cos(n phi + z)
+    statue    an upright column with a waist, its radius plus a cos(9 phi + 3 z), a growing downwards: folds; a head, an arm
     knot      a tube around the trefoil (sin t + 2 sin 2t, cos t - 2 cos 2t, -sin 3t)
     vessel    a solid of revolution, hollow from the top, with two rings for handles
-    coral     balls along branches that start in the middle
-    shell     a ball with a spiral groove
+    coral     tubes along bent branches that start in the middle, with ripples
+    shell     a ball with spiral ridges
 
 A photograph is the radiance of paths up to BOUNCES segments under one directional light, PATHS of them a sub-pixel; imported only where
 Mitsuba is there (pip install mvps[mitsuba]).
@@ -123,7 +123,7 @@ def coral() -> Function:
 
 
 def shell(x: Float) -> Float:
-    """A ball with a groove."""
+    """A ball with ridges."""
     distance = np.linalg.norm(x, axis=-1)
     azimuth = np.arctan2(x[:, 1], x[:, 0])
     return np.asarray((distance - 0.8 - 0.05 * np.cos(2 * azimuth + 16 * x[:, 2] / 0.8)) * 0.7)
