@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+from accuracy import machine
 
 from mvps.compare.curve import MEASURES, dominated, points_of
 from mvps.compare.pictures import cropped, side_by_side
@@ -112,9 +113,12 @@ def verdict(runs: Runs) -> str:
     return "\n".join(f"- {line}" for line in lines)
 
 
-def page(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> str:
-    """The page as Markdown."""
-    parts = ["# Results", f"`python benchmarks/results.py CAPTURES --out DIR`; errors as in `mvps.evaluate`. Methods: {words()}."]
+def page(runs: Mapping[str, Runs], sweeps: Mapping[str, Any], where: str) -> str:
+    """The page as Markdown. where: the machine that its seconds are of."""
+    command = "python benchmarks/results.py CAPTURES --out DIR"
+    parts = ["# Results", f"`{command}` on {where}; errors as in `mvps.evaluate`. Methods: {words()}."]
+    if sweeps:
+        parts.append("The sweeps behind the last three claims are those of `benchmarks/sweeps.md`.")
     parts += ["## Claims of the paper", as_markdown(claims(runs, sweeps))]
     for name, of_capture in runs.items():
         chosen = [of_capture[method] for method in METHODS if method in of_capture]
@@ -144,7 +148,7 @@ def main() -> None:
             shutil.copyfile(given.out / name / f"curve_{key}.svg", DOCS / f"{name}_{key}.svg")
     found = HERE / "sweeps.json"
     sweeps = json.loads(found.read_text(encoding="utf-8")) if found.exists() else {}
-    (DOCS / "results.md").write_text(page(runs, sweeps), encoding="utf-8")
+    (DOCS / "results.md").write_text(page(runs, sweeps, machine("cpu")), encoding="utf-8")
 
 
 if __name__ == "__main__":
