@@ -25,7 +25,7 @@ def test_a_split_mesh_follows_the_pixels_normals() -> None:
     place = nearest(truth, coarse.vertices).point
     seen = [index for index, _ in visible_in(capture, coarse)]
     given = Moved(replace(coarse, vertices=place), place, np.full(len(place), 0.1))
-    found = detailed(capture, given, true_maps(scene), seen, 0.03)
+    found = detailed(capture, given, true_maps(scene), seen)
     assert len(found.surface.vertices) > 3 * len(place) and np.allclose(found.share.sum(1), 1)
     normals = {view.name: of for view, of in zip(capture.views, scene.reconstruction.normal_maps, strict=True)}
     before, after = (mesh_normal_errors(s, normals, capture)["normal_error_deg"] for s in (given.surface, found.surface))
@@ -71,7 +71,7 @@ def test_what_no_view_sees_stays_where_it_was_closed() -> None:
     lower = ball.vertices[:, 2] < 0
     seen = [index[~lower[index]] for index, _ in visible_in(scene.capture, ball)]
     place = np.where(lower[:, None], 1.1, 1.0) * ball.vertices
-    found = detailed(scene.capture, Moved(ball, place, np.full(len(place), 0.1)), true_maps(scene), seen, 0.03)
+    found = detailed(scene.capture, Moved(ball, place, np.full(len(place), 0.1)), true_maps(scene), seen)
     below = found.surface.vertices[found.surface.vertices[:, 2] < -0.2 * RADIUS]
     assert np.abs(np.linalg.norm(below, axis=1) - RADIUS).max() < 0.01 * RADIUS
 
@@ -82,7 +82,7 @@ def test_a_split_ball_is_neither_larger_nor_smaller() -> None:
     place = RADIUS * normalise(coarse.vertices)
     seen = [index for index, _ in visible_in(scene.capture, coarse)]
     given = Moved(unbiased(replace(coarse, vertices=place)), place, np.full(len(place), 0.1))
-    found = detailed(scene.capture, given, true_maps(scene), seen, 0.03).surface
+    found = detailed(scene.capture, given, true_maps(scene), seen).surface
     before, after = (
         np.average(np.linalg.norm(s.vertices[s.faces].mean(1), axis=1) - RADIUS, weights=face_areas(s)) for s in (given.surface, found)
     )

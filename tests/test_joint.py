@@ -188,8 +188,13 @@ def test_smallest_rotations_turn_source_to_target() -> None:
 def test_divergence_of_unturned_faces_is_that_of_the_positions() -> None:
     ball = trimesh.creation.icosphere(subdivisions=2)
     surface = Surface(np.array(ball.vertices) * (1, 2, 3), np.array(ball.faces))
-    divergence = vertices._turned_divergence(surface, face_normals(surface))
-    assert np.allclose(divergence, -igl.cotmatrix(surface.vertices, surface.faces) @ surface.vertices)
+    even = np.ones(len(surface.faces))
+    divergence, laplacian = vertices._turned_divergence(surface, face_normals(surface), even), vertices._laplacian(surface, even)
+    assert abs(laplacian + igl.cotmatrix(surface.vertices, surface.faces)).max() < 1e-12
+    assert np.allclose(divergence, laplacian @ surface.vertices)
+    uneven = np.random.default_rng(0).uniform(0.1, 10, len(surface.faces))
+    divergence, laplacian = vertices._turned_divergence(surface, face_normals(surface), uneven), vertices._laplacian(surface, uneven)
+    assert np.allclose(divergence, laplacian @ surface.vertices)
 
 
 def test_views_agree_where_the_surface_is(scene: SphereScene) -> None:

@@ -20,7 +20,7 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mvps.joint.agreement import Agreement
-from mvps.joint.fused import face_targets
+from mvps.joint.fused import NORMAL_SIGMA, face_targets
 from mvps.joint.vertices import Moved, fuse
 from mvps.mesh import edges, lengths, normalise, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, Int, Material, NormalMap, Surface
@@ -36,14 +36,14 @@ class Detailed(NamedTuple):
     share: sp.csr_matrix
 
 
-def detailed(capture: Capture, coarse: Moved, maps: tuple[NormalMap, ...], seen: list[Int], error: float) -> Detailed:
+def detailed(capture: Capture, coarse: Moved, maps: tuple[NormalMap, ...], seen: list[Int], turn: float = NORMAL_SIGMA) -> Detailed:
     """The surface with its turning edges split and its faces turned to the maps' normals.
 
-    seen: per view the coarse vertices that it sees; error: of the maps' normals, radians.
+    seen: per view the coarse vertices that it sees; turn: of the surface along an edge, radians, from which it is split.
     """
     given, place, sigma = coarse
     normal, pairs = vertex_normals(given), edges(given)
-    turning = lengths(np.subtract(*normal[pairs.T])) > error
+    turning = lengths(np.subtract(*normal[pairs.T])) > turn
     surface, pairs = split_edges(given, turning), pairs[turning]
     share = sp.identity(len(place), format="csr")
     share = sp.vstack([share, (share[pairs[:, 0]] + share[pairs[:, 1]]) / 2], format="csr")
@@ -57,7 +57,7 @@ def detailed(capture: Capture, coarse: Moved, maps: tuple[NormalMap, ...], seen:
     spread[: len(place)] = np.where(views.any(1), sigma * np.sqrt(len(place) / len(outward)), np.inf)
     visible: list[Int] = [np.flatnonzero(of_view) for of_view in np.concatenate([views, views[pairs].all(1)]).T]
     target = face_targets(capture, surface, maps, visible, outward)
-    return Detailed(unbiased(fuse(surface, target, Agreement(offset, spread), error)[0]), share)
+    return Detailed(unbiased(fuse(surface, target.normal, Agreement(offset, spread), target.sigma)[0]), share)
 
 
 def interpolated(material: Material, of: Detailed) -> Material:

@@ -1,18 +1,51 @@
-"""What the views' normal maps say together, on the vertices and on the faces of a mesh: means weighted by confidence and viewing angle."""
+"""What the views' normal maps say together, on the vertices and on the faces of a mesh: means weighted by confidence and viewing angle.
+
+How well a face's normal is known. With weights w of n = (sum w)^2 / sum w^2 views, effectively, and R = |sum w n| / sum w, 1 - R is half of
+the mean squared angle between views and their mean (Mardia and Jupp 2000), so that they scatter with the variance (1 - R) n / (n - 1) of
+either tangential component. Taken over some twenty faces, because a variance from a handful of views is known to a factor of two at best,
+it gives the mean's standard deviation
+
+    sigma^2 = variance / n + SHARED_SIGMA^2
+
+since what is wrong with the lights is wrong in all views.
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
+from mvps.joint.pixels import few_lights
 from mvps.mesh import face_normals, lengths, normalise
-from mvps.scene import Capture, Float, Int, NormalMap, Surface
+from mvps.scene import Bool, Capture, Float, Int, NormalMap, Surface
 from mvps.silhouette import sampled
 
 LEAST_WEIGHT = 1e-3
 """Length of a weighted sum of normals below which it says nothing: one view at 88 degrees."""
+
+NORMAL_SIGMA = 0.03
+"""Standard deviation of the normals of faces about which views do not tell their own, radians: half of all pixels are better than 1 to 2
+degrees."""
+
+SHARED_SIGMA = 0.01
+"""What is common to all views, radians: lights are known to some tenths of a degree."""
+
+LEAST_VIEWS = 1.5
+"""Effective number of views from which their normals scatter."""
+
+ROUNDS = 2
+"""Of averaging variances with the faces around."""
+
+
+class FaceNormals(NamedTuple):
+    """Of n faces: normal (n, 3), unit, and the standard deviation sigma (n,) of either tangential component, radians."""
+
+    normal: Float
+    sigma: Float
 
 
 def vertex_maps(
@@ -30,29 +63,55 @@ def vertex_maps(
     return normalise(normal), albedo / np.maximum(total, 1e-12), total
 
 
-def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Int], otherwise: Float) -> Float:
-    """(F, 3) normals of the faces from the maps at their centres: a mean over corners would blur creases by an edge.
+def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], seen: list[Int], otherwise: Float) -> FaceNormals:
+    """Normals of the F faces from the maps at their centres: a mean over corners would blur creases by an edge.
 
     seen: per view the vertices it sees; a face is seen where all its corners are. otherwise (V, 3): vertex normals for unseen faces.
     """
     faces = surface.faces
     centre, facing = surface.vertices[faces].mean(1), face_normals(surface)
-    total = np.zeros((len(faces), 3))
+    total, weights, squares = np.zeros((len(faces), 3)), np.zeros(len(faces)), np.zeros(len(faces))
 
     def of_view(i: int) -> tuple[Int, Float]:
         view, photometric = capture.views[i], maps[i]
         visible = np.zeros(len(surface.vertices), bool)
         visible[seen[i]] = True
         chosen = np.flatnonzero(visible[faces].all(1))
-        image = np.zeros((*view.mask.shape, 3), np.float32)
-        image[view.mask] = photometric.normal * photometric.confidence[:, None]
+        image = np.zeros((*view.mask.shape, 4), np.float32)
+        image[view.mask] = np.column_stack([photometric.normal, np.ones(len(view.pixels))]) * photometric.confidence[:, None]
         points = centre[chosen]
         cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, points)).clip(0)
         return chosen, sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
 
     for chosen, summed in on_cores(of_view, range(len(capture.views))):
-        total[chosen] += summed
+        total[chosen] += summed[:, :3]
+        weights[chosen] += summed[:, 3]
+        squares[chosen] += summed[:, 3] ** 2
     unknown = lengths(total) <= LEAST_WEIGHT
     target = normalise(total)
     target[unknown] = normalise(otherwise[faces[unknown]].sum(1))
-    return target
+    # Of few lights the maps hold the mesh's own normals (pixels.py), about which views are of one mind.
+    sigma = np.full(len(faces), NORMAL_SIGMA) if few_lights(capture) else _sigma(total, weights, squares, surface)
+    return FaceNormals(target, sigma)
+
+
+def _sigma(total: Float, weights: Float, squares: Float, surface: Surface) -> Float:
+    """(F,) of the means of sums total (F, 3) of normals with weights (F,) in all, whose squares add up to squares (F,)."""
+    count = weights**2 / np.maximum(squares, LEAST_WEIGHT**2)
+    known = count >= LEAST_VIEWS
+    scatter = (1 - lengths(total) / np.maximum(weights, LEAST_WEIGHT)).clip(0)
+    variance = _around(scatter * count / np.maximum(count - 1, LEAST_VIEWS - 1), known, surface)
+    sigma = np.sqrt(variance / np.maximum(count, 1) + SHARED_SIGMA**2)
+    return np.where(np.isfinite(sigma), sigma, NORMAL_SIGMA)
+
+
+def _around(values: Float, known: Bool, surface: Surface) -> Float:
+    """(F,) values, where known, averaged with those of the faces around; NaN where none around is."""
+    corners, count = surface.faces.ravel(), len(surface.vertices)
+    share = known.astype(np.float64)
+    for _ in range(ROUNDS):
+        of_corners = [np.bincount(corners, np.repeat(of_faces * share, 3), count) for of_faces in (values, np.ones_like(share))]
+        top, bottom = (of_all[surface.faces].sum(1) for of_all in of_corners)
+        share = (bottom > 0).astype(np.float64)
+        values = np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1), 0)
+    return np.where(share > 0, values, np.nan)

@@ -47,9 +47,6 @@ from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_nor
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 from mvps.silhouette import mask_distances
 
-NORMAL_SIGMA = 0.03
-"""Standard deviation of the views' normals, radians, in the fusion with positions: half of all pixels are better than 1 to 2 degrees."""
-
 POSITION_FLOOR_PIXELS = 0.05
 """Smallest standard deviation of an agreed position: neighbouring costs share their pixels, so their agreement looks better than it is."""
 
@@ -167,7 +164,7 @@ def _moved(
         agreed = with_masks(agreement_of(surface), capture, surface, distance, floor)
         place = surface.vertices + agreed.offset[:, None] * vertex_normals(surface)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
-        surface, factor = fuse(surface, target, agreed, NORMAL_SIGMA, factor)
+        surface, factor = fuse(surface, target.normal, agreed, target.sigma, factor)
     known = np.zeros(len(surface.vertices), bool)
     known[np.concatenate(seen)] = True
     return Moved(closed_over(unbiased(surface), known, capture, distance), place, agreed.sigma)
@@ -249,7 +246,7 @@ def refine(
     result = replace(finished(state, settings, account, generator), carried=carried)
     if told is None or not settings.detail:
         return result
-    finer = detailed(capture, told, state.maps, seen, NORMAL_SIGMA)
+    finer = detailed(capture, told, state.maps, seen)
     material, unexplained = interpolated(result.material, finer), finer.share @ result.unexplained
     return replace(result, surface=finer.surface, material=material, unexplained=unexplained)
 

@@ -5,12 +5,12 @@ standard deviation of 1 / sqrt(12) of a pixel for every pixel of its length; its
 
 Fusion. Positions y minimise
 
-    sum_f A_f |grad y - R_f grad x|^2 / (a sigma_n^2)  +  sum_i rho(|y_i - t_i| / sigma_i)
+    sum_f A_f |grad y - R_f grad x|^2 / (a sigma_f^2)  +  sum_i rho(|y_i - t_i| / sigma_i)
 
-R_f turns face f's normal to the views' (fused.py); t_i is the position on which views and masks agree, sigma_n the error of normals in
+R_f turns face f's normal to the views' (fused.py); t_i is the position on which views and masks agree, sigma_f the error of f's normal in
 radians, a the mean area of a vertex (normals are independent from vertex to vertex). Its minimum is one sparse solve
 (cotangent weights: Yu et al. 2004; normals and positions together: Nehab et al. 2005): normals decide detail shorter than
-2 pi sigma / sigma_n, positions what is longer.
+2 pi sigma / sigma_f, positions what is longer.
 """
 
 from __future__ import annotations
@@ -94,10 +94,20 @@ def turned(source: Float, target: Float, vectors: Float) -> Float:
     return result
 
 
-def _turned_divergence(surface: Surface, target: Float) -> Float:
-    """(V, 3) divergence of R_f grad x: a corner of face f takes R_f (n x opposite side) / 2, its hat function's gradient times the area."""
+def _laplacian(surface: Surface, weight: Float) -> sp.csr_matrix:
+    """(V, V) cotangent Laplacian, positive, with weights (F,) on the faces."""
+    first, second = (surface.faces[:, order].ravel() for order in ([1, 2, 0], [2, 0, 1]))
+    half = igl.cotmatrix_entries(surface.vertices, surface.faces) * weight[:, None]
+    aside = sp.coo_matrix((half.ravel(), (first, second)), (len(surface.vertices),) * 2).tocsr()
+    both = aside + aside.T
+    return sp.csr_matrix(sp.diags(np.asarray(both.sum(1)).ravel()) - both)
+
+
+def _turned_divergence(surface: Surface, target: Float, weight: Float) -> Float:
+    """(V, 3) divergence of weight (F,) R_f grad x: a corner of face f takes R_f (n x opposite side) / 2, its hat function's gradient times
+    the area."""
     normal, corners = face_normals(surface), [surface.vertices[surface.faces[:, k]] for k in range(3)]
-    first, second = (turned(normal, target, cross(normal, corners[k - 1] - corners[k - 2]) / 2) for k in (0, 1))
+    first, second = (turned(normal, target, cross(normal, corners[k - 1] - corners[k - 2]) / 2) * weight[:, None] for k in (0, 1))
     divergence = np.zeros_like(surface.vertices)
     # The three sides of a face add up to nothing.
     for k, share in enumerate((first, second, -first - second)):
@@ -107,24 +117,25 @@ def _turned_divergence(surface: Surface, target: Float) -> Float:
 
 
 def fuse(
-    surface: Surface, target: Float, agreed: Agreement, normal_sigma: float, factor: CholeskyLike | None = None
+    surface: Surface, target: Float, agreed: Agreement, normal_sigma: float | Float, factor: CholeskyLike | None = None
 ) -> tuple[Surface, CholeskyLike]:
     """The surface moved so that its faces follow `target` (F, 3), unit, and its vertices the agreed positions; same faces.
 
-    normal_sigma radians. The factor of the system may serve another fusion of a surface that has hardly moved.
+    normal_sigma: of the faces (F,), or one for all, radians. The factor of the system may serve another fusion of a surface that has hardly
+    moved.
     """
     x = surface.vertices
     area = face_areas(surface)
-    scale = len(x) / (normal_sigma**2 * area.sum())
+    scale = np.broadcast_to(len(x) / (normal_sigma**2 * area.sum()), area.shape)
     # Solved together, one that is no number would take all others with it.
     target = np.where(np.isfinite(target).all(1, keepdims=True), target, face_normals(surface))
     even, whole = surface, area > SLIVER * area.mean()
     if not whole.all():
-        even, target = Surface(x, surface.faces[whole]), target[whole]
-    L = igl.cotmatrix(x, even.faces) * -scale
+        even, target, scale = Surface(x, surface.faces[whole]), target[whole], scale[whole]
+    L = _laplacian(even, scale)
     known = np.isfinite(agreed.offset) & np.isfinite(agreed.sigma)
     offset, sigma = np.where(known, agreed.offset, 0), np.where(known, agreed.sigma, np.inf)
-    right = _turned_divergence(even, target) * scale
+    right = _turned_divergence(even, target, scale)
     outward = vertex_normals(surface)
     agreed_at, weight = x + offset[:, None] * outward, 1 / sigma**2
     # Vertices that no views agree on hold still softly: without them a patch seen by nobody would have no place.
