@@ -4,7 +4,8 @@
 
     region    left out: everything;  {"view": "view_04", "mask": "painted.png"}: what that camera sees of the mask's white;
               {"cluster": 1, "of": 3}: a kind of material, kinds being found from the shares of the lobes, 1 the least glossy
-    albedo    {"colour": [r, g, b]} linear, instead of the object's own;  {"factor": 0.8} or a factor per channel;  {"hue_deg": 30}
+    albedo    {"colour": [r, g, b]} linear, instead of the object's own;  {"factor": 0.8} or a factor per channel;  {"hue_deg": 30};
+              {"painted": "view_04.png", "view": "view_04"}: what that camera sees takes the picture's colours, but for its clear parts
     specular  {"factor": 2} of the weights,  {"sharpness_factor": 4} of the lobes' sharpness, highlights keeping their energy
     preset    "matte", "satin", "glossy", "polished", "gold": a whole material (PRESETS)
 
@@ -24,9 +25,10 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from mvps.camera import project
-from mvps.load.images import read_mask
-from mvps.pbr import reflectance_scale
+from mvps.load.images import read_mask, read_painting
+from mvps.pbr import linear_of_srgb, reflectance_scale
 from mvps.scene import Bool, Camera, CaptureError, Float, Int, Material, Surface
+from mvps.silhouette import sampled
 from mvps.visibility import ray_caster, visible_vertices
 
 PRESETS: Mapping[str, tuple[float, tuple[float, float, float] | None, bool]] = {
@@ -40,12 +42,19 @@ PRESETS: Mapping[str, tuple[float, tuple[float, float, float] | None, bool]] = {
 in Hoffman's notes for the course on physically based shading, SIGGRAPH 2010."""
 
 KEYS = {"region", "albedo", "specular", "preset"}
+REGION_KEYS = ({"view", "mask"}, {"cluster", "of"})
+
+LARGEST = 1e6
+"""Of a factor: the brightest light has as many times the radiance of the darkest shadow that photographs tell."""
 
 
 def read_edits(path: Path) -> list[dict[str, Any]]:
     """The edits of a file, masks' paths made absolute. CaptureError where it holds anything else."""
     try:
-        edits = json.loads(path.read_bytes())["edits"]
+        given = json.loads(path.read_bytes())
+        edits = given["edits"]
+        if set(given) != {"edits"}:
+            raise ValueError(f"beside edits also {', '.join(sorted(set(given) - {'edits'}))}")
         if not isinstance(edits, list) or not all(isinstance(one, dict) and set(one) <= KEYS for one in edits):
             raise ValueError(f"each edit has some of {', '.join(sorted(KEYS))}")
     except OSError as error:
@@ -53,9 +62,10 @@ def read_edits(path: Path) -> list[dict[str, Any]]:
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise CaptureError(f'{path}: wanted {{"edits": [...]}}, given something else ({error}); see docs/edits.md') from error
     for one in edits:
-        region = one.get("region")
-        if isinstance(region, dict) and isinstance(region.get("mask"), str):
-            one["region"] = region | {"mask": str(path.parent / region["mask"])}
+        for part, key in (("region", "mask"), ("albedo", "painted")):
+            named = one.get(part)
+            if isinstance(named, dict) and isinstance(named.get(key), str):
+                one[part] = named | {key: str(path.parent / named[key])}
     return edits
 
 
@@ -66,7 +76,9 @@ def edited(surface: Surface, material: Material, edits: Sequence[Mapping[str, An
             chosen = region_of(surface, material, edit.get("region"), cameras)
             if "preset" in edit:
                 material = with_preset(material, chosen, edit["preset"])
-            if "albedo" in edit:
+            if "painted" in edit.get("albedo", {}):
+                material = with_painted(surface, material, chosen, cameras, **edit["albedo"])
+            elif "albedo" in edit:
                 material = with_albedo(material, chosen, **edit["albedo"])
             if "specular" in edit:
                 material = with_specular(material, chosen, **edit["specular"])
@@ -83,18 +95,32 @@ def region_of(surface: Surface, material: Material, region: Any, cameras: Mappin
     """(V,) which vertices a region has."""
     if region is None:
         return np.ones(len(surface.vertices), bool)
+    if set(region) not in REGION_KEYS:
+        raise ValueError(f"a region of {' and '.join(sorted(region)) or 'nothing'}")
     if "cluster" in region:
-        return np.asarray(clusters(material, int(region["of"])) == int(region["cluster"]) - 1)
-    if region["view"] not in cameras:
-        raise CaptureError(f"region: wanted a view among {', '.join(cameras)}, given {region['view']!r}; give --capture for its views")
-    camera, mask = cameras[region["view"]], read_mask(Path(region["mask"]))
-    if mask.shape != (camera.height, camera.width):
-        raise CaptureError(f"{region['mask']}: wanted {camera.width} x {camera.height} pixels, given {mask.shape[1]} x {mask.shape[0]}")
+        kind, of = int(region["cluster"]), int(region["of"])
+        if not 1 <= kind <= of:
+            raise ValueError(f"cluster {kind} of {of}")
+        return np.asarray(clusters(material, of) == kind - 1)
+    camera, mask = _camera(cameras, region["view"]), read_mask(Path(region["mask"]))
+    _check_size(region["mask"], mask.shape, camera)
     seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera))
     column, row = np.floor(project(camera, surface.vertices[seen])[0]).astype(int).T
     chosen = np.zeros(len(surface.vertices), bool)
     chosen[seen[mask[row, column]]] = True
     return chosen
+
+
+def _camera(cameras: Mapping[str, Camera], name: Any) -> Camera:
+    if name not in cameras:
+        known = f"among {', '.join(cameras)}" if cameras else "of the photographs"
+        raise CaptureError(f"edit: wanted a view {known}, given {name!r}; give --capture for its views")
+    return cameras[name]
+
+
+def _check_size(path: str, shape: tuple[int, ...], camera: Camera) -> None:
+    if shape[:2] != (camera.height, camera.width):
+        raise CaptureError(f"{path}: wanted {camera.width} x {camera.height} pixels, given {shape[1]} x {shape[0]}")
 
 
 def clusters(material: Material, count: int) -> Int:
@@ -128,6 +154,21 @@ def with_albedo(
     return replace(material, albedo=albedo, residual=None)
 
 
+def with_painted(surface: Surface, material: Material, chosen: Bool, cameras: Mapping[str, Camera], painted: str, view: str) -> Material:
+    """The material with the colours of a picture, sRGB, of the view's size, on the chosen vertices that the view's camera sees; what the
+    picture has clear stays."""
+    camera, picture = _camera(cameras, view), read_painting(Path(painted))
+    _check_size(painted, picture.shape, camera)
+    seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera) & chosen)
+    at = project(camera, surface.vertices[seen])[0]
+    opacity = picture[..., 3:]
+    # A clear pixel has no colour of its own to mix into its neighbours'.
+    mixed = sampled(np.concatenate([linear_of_srgb(picture[..., :3]) * opacity, opacity], 2).astype(np.float32), at)
+    albedo = material.albedo.copy()
+    albedo[seen] += mixed[:, :3] * reflectance_scale(material) - mixed[:, 3:] * albedo[seen]
+    return replace(material, albedo=albedo, residual=None)
+
+
 def turned_hue(colours: Float, degrees: float) -> Float:
     """Colours (n, 3) with another hue; saturation and value as they were."""
     turned = [colorsys.hsv_to_rgb((h + degrees / 360) % 1, s, v) for h, s, v in (colorsys.rgb_to_hsv(*c) for c in colours.tolist())]
@@ -136,8 +177,9 @@ def turned_hue(colours: Float, degrees: float) -> Float:
 
 def with_specular(material: Material, chosen: Bool, factor: float = 1.0, sharpness_factor: float = 1.0) -> Material:
     """The material with other highlights on the chosen vertices; lobes of another sharpness are added to those there are."""
-    if not (factor >= 0 and sharpness_factor > 0):
-        raise ValueError(f"a factor of 0 or more and a sharpness_factor above 0, not {factor} and {sharpness_factor}")
+    if not (0 <= factor <= LARGEST and 1 / LARGEST <= sharpness_factor <= LARGEST):
+        limits = f"a factor of 0 to {LARGEST:g} and a sharpness_factor above 0, {1 / LARGEST:g} to {LARGEST:g}"
+        raise ValueError(f"{limits}, not {factor} and {sharpness_factor}")
     weight = material.specular_weight.copy()
     weight[chosen] *= factor
     if sharpness_factor == 1:
@@ -171,6 +213,6 @@ def with_preset(material: Material, chosen: Bool, name: str) -> Material:
 
 def _colour(value: float | Sequence[float]) -> Float:
     colour = np.broadcast_to(np.asarray(value, float), 3)
-    if not (np.isfinite(colour).all() and (colour >= 0).all()):
-        raise ValueError(f"numbers of 0 and more, not {value}")
+    if not ((colour >= 0) & (colour <= LARGEST)).all():
+        raise ValueError(f"numbers of 0 and more, up to {LARGEST:g}, not {value}")
     return colour

@@ -100,6 +100,11 @@ def white_level(reflectance: Float) -> float:
     return (float(np.percentile(brightest, BRIGHTEST)) or float(brightest.max()) or 1.0) if len(brightest) else 1.0
 
 
+def linear_of_srgb(code: Float) -> Float:
+    """Linear values of sRGB ones, both in [0, 1] (IEC 61966-2-1)."""
+    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
+
+
 def srgb_bytes(linear: Float) -> NDArray[np.uint8]:
     """8-bit sRGB (IEC 61966-2-1) of linear values, clipped to [0, 1]."""
     x: Any = np.clip(linear, 0, 1)

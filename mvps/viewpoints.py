@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,12 @@ from mvps.scene import Camera, CaptureError, Float, Surface
 FIELD_OF_VIEW = 30.0
 """Degrees across the shorter side of the image: a long lens's, which shows objects without distortion."""
 
+NAME = re.compile(r"[\w+-][\w .+-]{0,99}")
+"""Of a camera: a part of a file's name, in no other folder, that shells and video encoders take as it is."""
+
+LARGEST_SIDE = 16384
+"""Pixels of an image."""
+
 MARGIN = 1.05
 """Free space around an object that fills the image."""
 
@@ -21,8 +28,10 @@ MARGIN = 1.05
 def look_at(eye: Float, target: Float, up: Float, width: int, height: int, field_of_view: float = FIELD_OF_VIEW) -> Camera:
     """A camera at `eye` (3,) looking at `target` (3,), with `up` (3,) upwards in the image; field_of_view: degrees across the shorter side.
 
-    ValueError where the eye is at the target.
+    ValueError where the eye is at the target, or `up` is no direction.
     """
+    if lengths(np.asarray(up, float)) == 0:
+        raise ValueError(f"up: wanted a direction, given {tuple(np.asarray(up).tolist())}")
     if lengths(np.asarray(target, float) - eye) == 0:
         raise ValueError(f"camera: wanted an eye away from its target, given both at {tuple(np.asarray(eye).tolist())}")
     forward = normalise(np.asarray(target, float) - eye)
@@ -48,6 +57,8 @@ def turntable(
 ) -> list[Camera]:
     """Cameras evenly around the surface, so far away that it just fills the image from everywhere."""
     centre, radius = ball_around(surface)
+    if lengths(np.asarray(up, float)) == 0:
+        raise ValueError(f"up: wanted a direction, given {tuple(np.asarray(up).tolist())}")
     up = normalise(np.asarray(up, float))
     first = normalise(np.cross(up, np.eye(3)[np.abs(up).argmin()]))
     second = np.cross(up, first)
@@ -60,12 +71,13 @@ def turntable(
 
 def read_cameras(path: Path) -> dict[str, Camera]:
     """Cameras by name from JSON: {"cameras": [{"name", "K" 3x3, "rotation" 3x3, "translation" 3, "width", "height"}, ...]} with
-    camera_from_world in OpenCV axes and the first pixel's centre at (0.5, 0.5). CaptureError where it is none."""
+    camera_from_world in OpenCV axes and the first pixel's centre at (0.5, 0.5). Names become parts of files' names, so they are letters,
+    digits, spaces and . _ + -. CaptureError where it is none."""
     form = 'a list "cameras" of objects with name, K, rotation, translation, width and height'
     try:
         records = json.loads(path.read_bytes())["cameras"]
-        cameras = {str(record["name"]): _camera(record) for record in records}
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        cameras = {_name(record): _camera(record) for record in records}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise CaptureError(f"{path}: wanted {form}, given something else ({error}); see the help of --cameras") from error
     if not cameras or len(cameras) != len(records):
         raise CaptureError(f"{path}: wanted {form}, with different names, given {len(records)} cameras; correct the file")
@@ -74,4 +86,14 @@ def read_cameras(path: Path) -> dict[str, Camera]:
 
 def _camera(record: dict[str, Any]) -> Camera:
     K, rotation, translation = (np.array(record[key], float) for key in ("K", "rotation", "translation"))
-    return Camera(K, rotation, translation, int(record["height"]), int(record["width"]))
+    width, height = int(record["width"]), int(record["height"])
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise ValueError(f"an image of {width} x {height}, not 1 to {LARGEST_SIDE} pixels wide and high")
+    return Camera(K, rotation, translation, height, width)
+
+
+def _name(record: dict[str, Any]) -> str:
+    name = str(record["name"])
+    if not NAME.fullmatch(name):
+        raise ValueError(f"the name {name!r}, not letters, digits, spaces and . _ + -")
+    return name

@@ -26,16 +26,12 @@ from mvps.checks.prediction import BRIGHT_QUANTILE
 from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.hull import default_cells, signed_distance, visual_hull
+from mvps.pbr import linear_of_srgb
 from mvps.scene import Capture, Float, View
 from solvers.low_rank import factorise
 
 Curve = Callable[[Float], Float]
 """From code values to radiance, both over full scale."""
-
-
-def _srgb(code: Float) -> Float:
-    """IEC 61966-2-1."""
-    return np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4)
 
 
 def _power(exponent: float) -> Curve:
@@ -45,7 +41,7 @@ def _power(exponent: float) -> Curve:
 LINEAR = _power(1.0)
 
 CURVES: Mapping[str, Curve] = MappingProxyType(
-    {"sRGB": _srgb, "gamma 2.2": _power(2.2), "gamma 1.8": _power(1.8), "gamma 2.4": _power(2.4)}
+    {"sRGB": linear_of_srgb, "gamma 2.2": _power(2.2), "gamma 1.8": _power(1.8), "gamma 2.4": _power(2.4)}
 )
 """Those of displays and of files for them."""
 

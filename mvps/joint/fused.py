@@ -5,9 +5,10 @@ the mean squared angle between views and their mean (Mardia and Jupp 2000), so t
 either tangential component. Taken over some twenty faces, because a variance from a handful of views is known to a factor of two at best,
 it gives the mean's standard deviation
 
-    sigma^2 = variance / n + SHARED_SIGMA^2
+    sigma^2 = variance / n + SHARED_SIGMA^2        and no more than NORMAL_SIGMA
 
-since what is wrong with the lights is wrong in all views.
+since what is wrong with the lights is wrong in all views, and since where views differ by more there is nothing better: positions come
+from the same views.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ LEAST_WEIGHT = 1e-3
 """Length of a weighted sum of normals below which it says nothing: one view at 88 degrees."""
 
 NORMAL_SIGMA = 0.03
-"""Standard deviation of the normals of faces about which views do not tell their own, radians: half of all pixels are better than 1 to 2
+"""Largest standard deviation of a face's normal, and where views do not tell, radians: half of all pixels are better than 1 to 2
 degrees."""
 
 SHARED_SIGMA = 0.01
@@ -81,7 +82,9 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
         image[view.mask] = np.column_stack([photometric.normal, np.ones(len(view.pixels))]) * photometric.confidence[:, None]
         points = centre[chosen]
         cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, points)).clip(0)
-        return chosen, sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
+        found = sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
+        # Between pixels of a bent surface the mean is shorter, which is no scatter of views.
+        return chosen, np.column_stack([normalise(found[:, :3]) * found[:, 3:], found[:, 3]])
 
     for chosen, summed in on_cores(of_view, range(len(capture.views))):
         total[chosen] += summed[:, :3]
@@ -101,8 +104,7 @@ def _sigma(total: Float, weights: Float, squares: Float, surface: Surface) -> Fl
     known = count >= LEAST_VIEWS
     scatter = (1 - lengths(total) / np.maximum(weights, LEAST_WEIGHT)).clip(0)
     variance = _around(scatter * count / np.maximum(count - 1, LEAST_VIEWS - 1), known, surface)
-    sigma = np.sqrt(variance / np.maximum(count, 1) + SHARED_SIGMA**2)
-    return np.where(np.isfinite(sigma), sigma, NORMAL_SIGMA)
+    return np.fmin(np.sqrt(variance / np.maximum(count, 1) + SHARED_SIGMA**2), NORMAL_SIGMA)
 
 
 def _around(values: Float, known: Bool, surface: Surface) -> Float:

@@ -123,7 +123,25 @@ def _fault(data: bytes) -> str:
 
 def decode(path: Path, header: Header) -> NDArray[Any]:
     """(height, width, 3) RGB code values, uint8 or uint16 as stored; grey is repeated thrice, transparency dropped."""
-    wanted = "a photograph as PNG"
+    image = _decoded(path, header, "a photograph as PNG")
+    return np.broadcast_to(image, (*header[:2], 3)) if image.shape[2] == 1 else image[..., 2::-1]
+
+
+def read_painting(path: Path) -> NDArray[np.float32]:
+    """(height, width, 4) red, green, blue and opacity of a painted picture, code values over full scale."""
+    wanted = "a painted picture as PNG"
+    header = read_header(path, wanted)
+    check_packing(path, header)
+    image = _decoded(path, header, wanted)
+    full = np.float32(65535 if header.bits == 16 else 255)
+    colour = np.broadcast_to(image, (*header[:2], 3)) if image.shape[2] == 1 else image[..., 2::-1]
+    opacity = image[..., 3:] if image.shape[2] == 4 else np.full((*header[:2], 1), full)
+    painted: NDArray[np.float32] = np.concatenate([colour, opacity], 2).astype(np.float32) / full
+    return painted
+
+
+def _decoded(path: Path, header: Header, wanted: str) -> NDArray[Any]:
+    """(height, width, channels) as the decoder orders them: grey, or blue, green, red and perhaps opacity."""
     data = read_bytes(path, wanted, "restore the file or correct the file's name")
     fault = _fault(data)
     if fault:
@@ -134,9 +152,8 @@ def decode(path: Path, header: Header) -> NDArray[Any]:
         image = None
     if image is None or image.shape[:2] != header[:2] or image.dtype != (np.uint16 if header.bits == 16 else np.uint8):
         raise complaint(path, wanted, "a PNG that cannot be decoded", "export it again")
-    if image.ndim == 2:
-        image = image[..., None]
-    return np.broadcast_to(image, (*header[:2], 3)) if image.shape[2] == 1 else image[..., 2::-1]
+    found: NDArray[Any] = image[..., None] if image.ndim == 2 else image
+    return found
 
 
 def read_mask(path: Path) -> Bool:
