@@ -70,7 +70,10 @@ def measured(sample: Sample, folder: Path, preset: str, limit: float = 300.0) ->
     judged = ran([sys.executable, "-m", "mvps.evaluate", str(result), "--truth", str(good), "--json", str(figures)], limit)
     if judged.code != 0:
         return row | {"status": "NO FIGURES", "said": last_line(judged.said)}
-    status = json.loads((result / "metrics.json").read_text(encoding="utf-8"))["status"]
+    metrics = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
+    status = metrics["status"]
+    # The system's figure starts with the peak of this process.
+    row["peak_memory_mb"] = max(stage["peak_memory_mb"] for stage in metrics["stages"])
     errors = json.loads(figures.read_text(encoding="utf-8"))
     kept = {key: errors[key] for _, key, _, _ in COLUMNS if key in errors}
     return row | kept | {"status": status["name"], "said": status["text"]}

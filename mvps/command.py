@@ -143,8 +143,9 @@ def _of_the_machine(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         name = error.filename if isinstance(error.filename, str) else os.fsdecode(error.filename)
         return f"{name}: {error.strerror}; check the path, its permissions and the free space"
-    if isinstance(error, OSError) and error.errno in NO_ROOM:
-        return f"writing a file: {error.strerror}; make room, or give another --out"
+    # numpy writes arrays itself, and says "6912 requested and 5088 written" without a number.
+    if isinstance(error, OSError) and (error.errno in NO_ROOM or "requested and" in str(error)):
+        return f"writing a file: {error.strerror or 'no space left'}; make room, or give another --out"
     return ""
 
 
@@ -165,13 +166,32 @@ def number_list(text: str) -> tuple[int, ...]:
 
 def positive(text: str) -> float:
     """A finite number above zero."""
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
+    number = _number(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"wanted a number above 0, given {text!r}")
     return number
+
+
+def finite(text: str) -> float:
+    """A finite number."""
+    number = _number(text)
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"wanted a finite number, given {text!r}")
+    return number
+
+
+def whole(text: str) -> int:
+    """A whole number from 0."""
+    if not text.isdecimal() or len(text) > 18:
+        raise argparse.ArgumentTypeError(f"wanted a whole number of 0 and more, given {text!r}")
+    return int(text)
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def lights_argument(text: str) -> tuple[int, ...] | Mapping[str, tuple[int, ...]]:

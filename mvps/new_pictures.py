@@ -38,6 +38,8 @@ FRAMES_PER_SECOND = 24
 
 def write_pictures(given: Namespace) -> None:
     """Renders what the options of mvps.render ask for into a new folder. CaptureError about everything that is wrong with them."""
+    if given.video and given.format == "exr":
+        raise CaptureError("--video: wanted pictures in png or png16 to make it of, given --format exr")
     result = read_reconstruction(given.result)
     cameras = chosen_cameras(given, result)
     material = result.material

@@ -17,7 +17,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mvps.command import number_list, parse, parser, positive, run
+from mvps.command import finite, number_list, parse, parser, positive, run, whole
 from mvps.scene import CaptureError
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ SAMPLES_PER_CHUNK = 1 << 22
 LAYERS = ("image", "albedo", "specular", "normals", "depth", "shadow", "confidence")
 """What layers.py renders, by name; here, because --help does not wait for it."""
 FORMATS = ("png", "png16", "exr")
+LARGEST = 1e100
+"""Of an option's numbers: their squares are numbers too."""
 
 
 def render_view(
@@ -65,10 +67,16 @@ def render_view(
     return image.reshape(camera.height, camera.width, -1, 3), hit.reshape(camera.height, camera.width)
 
 
-def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: Path) -> None:
-    """Re-render views (numbers from 1; None: all of the result's) of a result with the capture's cameras into a new folder."""
+def render_views(
+    result: Path, capture: Path, views: Sequence[int] | None, out: Path, edit: Path | None = None, bounce: bool = True
+) -> None:
+    """Re-render views (numbers from 1; None: all of the result's) of a result with the capture's cameras into a new folder. edit: a file of
+    edits of the material; bounce: with light that surfaces send each other."""
+    from dataclasses import replace
+
     import numpy as np
 
+    from mvps.edits import edited, read_edits
     from mvps.export import read_reconstruction
     from mvps.folders import appearing_whole
     from mvps.load import read_capture
@@ -86,7 +94,12 @@ def render_views(result: Path, capture: Path, views: Sequence[int] | None, out: 
         raise CaptureError(
             f"{capture}: wanted the capture of the result's {', '.join(reconstruction.views)}, given one without these views"
         )
-    caster, senders = ray_caster(reconstruction.surface), light_senders(reconstruction.surface, reconstruction.material)
+    if edit is not None:
+        cameras = {view.name: view.camera for view in read_capture(capture, lights=[1]).views}
+        material = edited(reconstruction.surface, reconstruction.material, read_edits(edit), cameras)
+        reconstruction = replace(reconstruction, material=material)
+    caster = ray_caster(reconstruction.surface)
+    senders = light_senders(reconstruction.surface, reconstruction.material) if bounce else None
     with appearing_whole(out) as writing, Progress().stage("render", total=len(chosen)) as stage:
         for view in chosen:
             image, mask = render_view(caster, reconstruction, view.name, view.camera, senders)
@@ -106,7 +119,7 @@ def numbers(counts: tuple[int, ...], wanted: str) -> Callable[[str], tuple[float
             found = tuple(float(word) for word in text.split(","))
         except ValueError:
             found = ()
-        if len(found) not in counts or not all(abs(x) < float("inf") for x in found):
+        if len(found) not in counts or not all(abs(x) < LARGEST for x in found):
             raise ArgumentTypeError(f"wanted {wanted}, separated by commas, given {text!r}")
         return found
 
@@ -119,6 +132,22 @@ def size(text: str) -> tuple[int, int]:
     if len(words) != 2 or not all(word.isdecimal() and 1 <= int(word) <= 16384 for word in words):
         raise ArgumentTypeError(f"wanted width and height such as 800x600, up to 16384, given {text!r}")
     return int(words[0]), int(words[1])
+
+
+def angle(text: str) -> float:
+    """Degrees between 0 and 180."""
+    degrees = positive(text)
+    if degrees >= 180:
+        raise ArgumentTypeError(f"wanted degrees below 180, given {text!r}")
+    return degrees
+
+
+def count(text: str) -> int:
+    """A whole number from 1 to 65536."""
+    number = whole(text)
+    if not 1 <= number <= 65536:
+        raise ArgumentTypeError(f"wanted 1 to 65536, given {text!r}")
+    return number
 
 
 def layer_list(text: str) -> tuple[str, ...]:
@@ -134,9 +163,10 @@ def options() -> Any:
     """The command line's parser."""
     made = parser(
         "mvps.render",
-        "Pictures of a result. With --capture alone: its views, each under its own lights, as linear 16-bit PNG files\n"
-        "DIR/view_04/001.png and so on, at the exposure of the photographs; mask.png beside them shows where the surface is.\n"
-        "With a light or a camera of your own: DIR/CAMERA_LAYER.png, transparent where nothing is.",
+        "Pictures of a result. With --capture and no more than --views, --edit, --no-bounce: its views, each under its own lights,\n"
+        "as linear 16-bit PNG files DIR/view_04/001.png and so on, at the exposure of the photographs; mask.png beside them shows\n"
+        "where the surface is. With a light or a camera of your own, layers, a format, an exposure or a video:\n"
+        "DIR/CAMERA_LAYER.png, transparent where nothing is.",
     )
     made.add_argument("result", type=Path, metavar="RESULT", help="folder that mvps.reconstruct wrote")
     made.add_argument("--out", type=Path, required=True, default=SUPPRESS, metavar="DIR", help="new folder for the images")
@@ -147,17 +177,17 @@ def options() -> Any:
     cameras.add_argument("--camera", type=vector, default=SUPPRESS, metavar="X,Y,Z", help="place of a camera, world units")
     cameras.add_argument("--target", type=vector, default=SUPPRESS, metavar="X,Y,Z", help="what it looks at; else the object's middle")
     cameras.add_argument("--turntable", type=int, default=SUPPRESS, metavar="FRAMES", help="cameras evenly around the object")
-    cameras.add_argument("--elevation", type=float, default=15.0, metavar="DEG", help="of the turntable's cameras above the horizon")
+    cameras.add_argument("--elevation", type=finite, default=15.0, metavar="DEG", help="of the turntable's cameras above the horizon")
     cameras.add_argument("--cameras", type=Path, default=SUPPRESS, metavar="FILE", help=CAMERAS_HELP)
     cameras.add_argument("--up", type=vector, default=(0.0, 0.0, 1.0), metavar="X,Y,Z", help=UP_HELP)
-    cameras.add_argument("--fov", type=positive, default=30.0, metavar="DEG", help="field of view of --camera and --turntable")
+    cameras.add_argument("--fov", type=angle, default=30.0, metavar="DEG", help="field of view of --camera and --turntable")
     cameras.add_argument("--size", type=size, default=(640, 640), metavar="WxH", help="pixels of --camera and --turntable")
     lights = made.add_argument_group("lights", "together; without any, one from above the camera's right shoulder")
     lights.add_argument("--light", type=colour, action="append", default=[], metavar="X,Y,Z[,R,G,B]", help="towards a light; its intensity")
     lights.add_argument("--point", type=colour, action="append", default=[], metavar="X,Y,Z[,R,G,B]", help=POINT_HELP)
     lights.add_argument("--envmap", type=Path, default=SUPPRESS, metavar="FILE", help="environment map, .hdr or .exr, equirectangular")
-    lights.add_argument("--envmap-turn", type=float, default=0.0, metavar="DEG", help="turn of the environment about --up")
-    lights.add_argument("--envmap-lights", type=int, default=256, metavar="N", help="directional lights that stand for it")
+    lights.add_argument("--envmap-turn", type=finite, default=0.0, metavar="DEG", help="turn of the environment about --up")
+    lights.add_argument("--envmap-lights", type=count, default=256, metavar="N", help="directional lights that stand for it")
     lights.add_argument("--frame", choices=("world", "camera"), default="world", help=FRAME_HELP)
     lights.add_argument("--no-bounce", action="store_true", help="without light that surfaces send each other")
     pictures = made.add_argument_group("pictures")
@@ -176,7 +206,7 @@ def options() -> Any:
 
 
 CAMERAS_HELP = 'JSON: {"cameras": [{"name", "K", "rotation", "translation", "width", "height"}]}, camera_from_world, OpenCV axes'
-POINT_HELP = "place of a point of light, world units; its intensity at the object's middle"
+POINT_HELP = "place of a point of light, world units; its intensity at the object's middle; surfaces send none of it on"
 UP_HELP = "upwards in the world, for --camera, --turntable and --envmap"
 EXPOSURE_HELP = "factor of radiance; if left out, highlights of the first picture become white"
 FRAME_HELP = "of --light and --point; camera: x right, y up, z towards the camera, fixed to each camera, its origin in the object's middle"
@@ -185,8 +215,18 @@ OWN = ("camera", "turntable", "cameras", "envmap")
 
 def asks_for_own(given: Namespace) -> bool:
     """Whether the options want more than a capture's views under their own lights."""
-    plain = given.layers == ("image",) and given.format == "png" and not (given.video or "exposure" in given or "edit" in given)
+    plain = given.layers == ("image",) and given.format == "png" and not (given.video or "exposure" in given)
     return not plain or bool(given.light or given.point) or any(name in given for name in OWN)
+
+
+def check_used(given: Namespace) -> None:
+    """CaptureError about an option that a capture's views under their own lights have no use for."""
+    for name in ("size", "fov", "up", "elevation", "target", "frame", "envmap_turn", "envmap_lights"):
+        if name in given and getattr(given, name) != options().get_default(name):
+            raise CaptureError(
+                f"--{name.replace('_', '-')}: wanted together with a camera or a light of your own, given with a capture's views under"
+                " their own lights; leave it out"
+            )
 
 
 def main(argv: Sequence[str]) -> None:
@@ -195,7 +235,9 @@ def main(argv: Sequence[str]) -> None:
     if not asks_for_own(given):
         if "capture" not in given:
             raise CaptureError("wanted --capture for the photographs' views, or a light or a camera, given neither; see --help")
-        render_views(given.result, given.capture, given.views if "views" in given else None, given.out)
+        check_used(given)
+        views, edit = (getattr(given, name, None) for name in ("views", "edit"))
+        render_views(given.result, given.capture, views, given.out, edit, not given.no_bounce)
         return
     from mvps.new_pictures import write_pictures
 

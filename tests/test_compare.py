@@ -68,6 +68,16 @@ def test_what_is_there_is_not_run_again(capture: Path, compared: Path) -> None:
     assert (compared / "hull" / "mesh.ply").stat().st_mtime_ns > before
 
 
+def test_another_capture_is_not_told_anothers_figures(capture: Path, tmp_path: Path) -> None:
+    other, out = tmp_path / "other", tmp_path / "out"
+    write_capture(*render_capture(SceneSettings(views=5, lights=8, size=64, seed=1)), other)
+    found = []
+    for one in (capture, other):
+        assert run(main, [str(one), "--methods", "hull", "--out", str(out), "--quiet"]) == 0
+        found.append(known_runs(out)["hull"].errors["chamfer_px"])
+    assert found[0] != found[1]
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

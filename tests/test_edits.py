@@ -66,6 +66,26 @@ def test_a_painted_region_is_what_its_camera_sees(tmp_path: Path) -> None:
     assert black.mean() == pytest.approx(0.25, abs=0.06)
 
 
+def test_a_painted_picture_covers_what_its_camera_sees(tmp_path: Path) -> None:
+    """Opaque red on the right, half of it in the middle rows, clear on the left; nothing behind changes."""
+    view = SCENE.capture.views[0]
+    height, width = view.mask.shape
+    picture = np.zeros((height, width, 4), np.uint8)
+    picture[:, width // 2 :] = (0, 0, 255, 255)
+    cv2.imwrite(str(tmp_path / "over.png"), picture)
+    path = tmp_path / "edits.json"
+    path.write_text(json.dumps({"edits": [{"albedo": {"painted": "over.png", "view": "view_01"}}]}))
+    found = edited(SURFACE, MATERIAL, read_edits(path), CAMERAS).albedo
+    local = SURFACE.vertices @ view.camera.rotation.T
+    red = np.isclose(found, np.array([1.0, 0, 0]) * reflectance_scale(MATERIAL)).all(1)
+    same = np.isclose(found, MATERIAL.albedo).all(1)
+    assert red.mean() > 0.1 and (local[red, 0] > 0).all() and (local[red, 2] < 0).all()
+    assert same[local[:, 2] > 0].all() and same[local[:, 0] < -2].all() and (red | same).mean() > 0.9
+    cv2.imwrite(str(tmp_path / "over.png"), picture[:-1])
+    with pytest.raises(CaptureError, match=r"over.png: wanted \d+ x \d+ pixels"):
+        edited(SURFACE, MATERIAL, read_edits(path), CAMERAS)
+
+
 def test_kinds_of_material_are_found_from_the_weights() -> None:
     shiny = SURFACE.vertices[:, 2] > 0
     material = replace(MATERIAL, albedo=np.ones_like(MATERIAL.albedo), specular_weight=np.where(shiny[:, None], [0.5, 0.5], [0.05, 0.0]))
@@ -83,6 +103,13 @@ def test_kinds_of_material_are_found_from_the_weights() -> None:
         ({"specular": {"sharpness_factor": 0}}, "sharpness_factor above 0"),
         ({"region": {"view": "view_77", "mask": "x.png"}, "preset": "gold"}, "wanted a view among view_01"),
         ({"region": {"cluster": 1, "of": 99}, "preset": "gold"}, "1 to 16 clusters"),
+        ({"region": {"cluster": 4, "of": 3}, "preset": "gold"}, "cluster 4 of 3"),
+        ({"region": {"cluster": 0, "of": 3}, "preset": "gold"}, "cluster 0 of 3"),
+        ({"region": {"cluster": 1, "of": 3, "colour": 2}, "preset": "gold"}, "a region of cluster and colour and of"),
+        ({"specular": {"sharpness_factor": 1e300}}, "sharpness_factor"),
+        ({"albedo": {"painted": "x.png", "view": "view_77"}}, "wanted a view among view_01"),
+        ({"albedo": {"painted": "nowhere.png", "view": "view_01"}}, "nowhere.png: wanted a painted picture"),
+        ({"albedo": {"painted": "x.png", "view": "view_01", "factor": 2}}, "unexpected keyword"),
     ],
 )
 def test_wrong_edits_are_refused(edit: dict[str, Any], said: str) -> None:
@@ -90,7 +117,7 @@ def test_wrong_edits_are_refused(edit: dict[str, Any], said: str) -> None:
         after(edit)
 
 
-@pytest.mark.parametrize("text", ["", "{}", '{"edits": 3}', '{"edits": [{"colour": 1}]}'])
+@pytest.mark.parametrize("text", ['{"edits": [], "more": 1}', "", "{}", '{"edits": 3}', '{"edits": [{"colour": 1}]}'])
 def test_wrong_files_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "e.json").write_text(text)
     with pytest.raises(CaptureError, match=r"e.json: wanted"):

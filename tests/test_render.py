@@ -167,9 +167,27 @@ def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp
     assert left.sum() > right.sum()
 
 
+def test_views_under_their_own_lights_with_an_edit(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    (tmp_path / "edits.json").write_text('{"edits": [{"albedo": {"factor": [0, 1, 1]}}, {"specular": {"factor": 0}}]}')
+    views = ["--capture", str(folders[1]), "--views", "1"]
+    assert rendered_files(folders, tmp_path / "plain", *views) == ["view_01"]
+    assert rendered_files(folders, tmp_path / "edited", *views, "--edit", str(tmp_path / "edits.json")) == ["view_01"]
+    plain, edited = (image(tmp_path / name / "view_01" / "001.png") for name in ("plain", "edited"))
+    assert plain[..., 0].any() and not edited[..., 0].any() and edited[..., 1].any()
+    assert (edited[..., 1] <= plain[..., 1]).all()
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        (["--fov", "180"], "wanted degrees below 180"),
+        (["--envmap-turn", "nan"], "wanted a finite number"),
+        (["--envmap-lights", "0"], "wanted 1 to 65536"),
+        (["--light", "1e200,0,1"], "wanted three numbers"),
+        (["--turntable", "1", "--up", "0,0,0"], "up: wanted a direction"),
+        (["--camera", "400,0,0", "--up", "0,0,0"], "up: wanted a direction"),
+        (["--turntable", "2", "--video", "--format", "exr"], "wanted pictures in png"),
+        (["--capture", "CAPTURE", "--size", "9x9"], "--size: wanted together with"),
         (["--layers", "image,colour"], "wanted some of image"),
         (["--light", "1,2"], "wanted three numbers"),
         (["--light", "0,0,0"], "wanted a direction"),
@@ -188,5 +206,6 @@ def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp
 def test_bad_options_write_nothing(
     folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
 ) -> None:
-    assert run(main, [str(folders[0]), "--out", str(tmp_path / "out"), *options]) == 2
+    named = [str(folders[1]) if option == "CAPTURE" else option for option in options]
+    assert run(main, [str(folders[0]), "--out", str(tmp_path / "out"), *named]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

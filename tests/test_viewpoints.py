@@ -62,3 +62,16 @@ def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(CaptureError, match=r"cameras.json: wanted a list"):
         read_cameras(path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"name": "../escaped"}, {"name": "/tmp/a"}, {"name": "a/b"}, {"name": ""}, {"width": 1e999}, {"height": 0}, {"width": 99999}]
+)
+def test_names_and_sizes_that_make_no_file_are_refused(tmp_path: Path, change: dict[str, object]) -> None:
+    """A name is a part of a file's name: one with a folder in it would be written elsewhere."""
+    camera = look_at(np.array([5.0, 1, 2]), np.zeros(3), np.array([0.0, 0, 1]), 80, 60)
+    record = {"name": "a", "K": camera.K.tolist(), "rotation": camera.rotation.tolist(), "translation": camera.translation.tolist()}
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps({"cameras": [record | {"width": 80, "height": 60} | change]}))
+    with pytest.raises(CaptureError, match=r"cameras.json: wanted a list"):
+        read_cameras(path)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from mvps.evaluate import evaluate_result, write_json
-from mvps.inputs import DAMAGED, JSON_LIMIT, parsed_json, read_file
+from mvps.inputs import DAMAGED, JSON_LIMIT, parsed_json, read_file, shown
 from mvps.load import read_truth
 from mvps.progress import Progress
 from mvps.scene import CaptureError
@@ -29,8 +29,9 @@ RUNS = "runs.json"
 
 @dataclass(frozen=True)
 class Run:
-    """What came of a method. options: of mvps.methods, by which a run is known; failed: why there is no result, else empty; status: of the
-    result; protocols: of mvps.evaluate that were measured; errors: by their names, where the capture has truth."""
+    """What came of a method. capture (its folder) and options (of mvps.methods): by which a run is known; failed: why there is no result,
+    else empty; status: of the result; protocols: of mvps.evaluate that were measured; errors: by their names, where the capture has
+    truth."""
 
     method: str
     options: tuple[str, ...]
@@ -41,6 +42,7 @@ class Run:
     status: str = ""
     protocols: tuple[str, ...] = ()
     errors: dict[str, float] = field(default_factory=dict)
+    capture: str = ""
 
 
 def known_runs(out: Path) -> dict[str, Run]:
@@ -69,12 +71,15 @@ def run_all(
     if out.exists() and any(out.iterdir()) and not (out / RUNS).exists():
         raise CaptureError(f"{out}: wanted a new or empty folder or an earlier comparison, given a folder with other files")
     out.mkdir(parents=True, exist_ok=True)
-    runs = known_runs(out)
+    runs, place = known_runs(out), shown(capture.resolve())
+    # What is interrupted in its first run is an earlier comparison too.
+    write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
     for name in methods:
         known = runs.get(name)
-        if known is None or known.options != tuple(options) or known.failed or not (out / name / "settings.json").exists():
+        same = known is not None and known.options == tuple(options) and known.capture == place and not known.failed
+        if not same or not (out / name / "settings.json").exists():
             with progress.stage(name) as stage:
-                runs[name] = _run(capture, name, options, out / name)
+                runs[name] = replace(_run(capture, name, options, out / name), capture=place)
                 stage.status(runs[name].failed or runs[name].status)
         runs[name] = _measured(runs[name], capture, out / name, protocols)
         write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
@@ -87,7 +92,13 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+", encoding="utf-8") as complaints:
         process = subprocess.Popen(command, stderr=complaints)
-        _, status, usage = os.wait4(process.pid, 0)
+        try:
+            _, status, usage = os.wait4(process.pid, 0)
+        except BaseException:
+            # Whoever ends the comparison wants nothing of it to go on.
+            process.terminate()
+            process.wait()
+            raise
         seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
         busy = usage.ru_utime + usage.ru_stime
         process.returncode = code
@@ -103,8 +114,9 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
     if code:
         raise RuntimeError(f"{' '.join(command)}: exit code {code}\n{said}")
     metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
-    # Linux counts in units of 1024 bytes.
-    return Run(name, tuple(options), seconds, busy, usage.ru_maxrss * 1024 / 1e6, "", metrics["status"]["name"])
+    # Not the system's figure: a process starts with the peak of the one that started it.
+    peak = max(stage["peak_memory_mb"] for stage in metrics["stages"])
+    return Run(name, tuple(options), seconds, busy, peak, "", metrics["status"]["name"])
 
 
 def _measured(run: Run, capture: Path, folder: Path, protocols: Sequence[str]) -> Run:

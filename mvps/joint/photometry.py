@@ -33,7 +33,7 @@ from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose, judged
 from mvps.mesh import angles_deg, edges, lengths, mean_edge_length, normalise, vertex_normals
-from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
+from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
 LIGHT_VERTICES, TRIAL_VERTICES = 4000, 1000
 """Vertices, in patches, that stand for all when lights are solved, and when components of the model are tried."""
@@ -347,6 +347,8 @@ def material_of(state: State, albedo: Float) -> Material:
     """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
     assert state.vertices is not None
     vertices, known = state.vertices, np.isfinite(albedo).all(1)
+    if not known.any():
+        raise CaptureError("lights: wanted some that reach the object, given none under which a view sees it lit; check their directions")
     nearest = np.arange(len(albedo))
     nearest[~known] = np.flatnonzero(known)[neighbours(cKDTree(state.surface.vertices[known]), state.surface.vertices[~known])[1]]
     normal = normalise(vertices.normal.double().cpu().numpy())

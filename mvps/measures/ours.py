@@ -25,7 +25,7 @@ from mvps.measures.images import photograph_errors
 from mvps.measures.lights import by_photograph, held_out_photographs, held_out_views, light_errors, true_lights, unseen_views
 from mvps.measures.points import f_score
 from mvps.mesh import angles_deg, nearest, normalise, vertex_normals
-from mvps.scene import Capture, Float, Material, Reconstruction, Surface, Truth, View, expected_error_deg
+from mvps.scene import Capture, CaptureError, Float, Material, Reconstruction, Surface, Truth, View, expected_error_deg
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 
 CONFIDENCE_GROUPS = 10
@@ -113,6 +113,11 @@ def normal_errors(
             continue
         wanted = view.mask & np.isfinite(truth[view.name]).all(-1)
         given = np.asarray(estimated.get(view.name, np.full((*view.mask.shape, 3), np.nan)), np.float64)
+        if given.shape != truth[view.name].shape:
+            raise CaptureError(
+                f"normals of {view.name}: wanted {view.mask.shape[1]} x {view.mask.shape[0]} pixels as in the capture, given"
+                f" {given.shape[1]} x {given.shape[0]}; give the result of this capture"
+            )
         both = wanted & np.isfinite(given).all(-1)
         angle = angles_deg(given[both], truth[view.name][both])
         for group in ("", "held_out_" if view.name in held_out else "fitted_"):
