@@ -62,13 +62,42 @@ def glossy(specular_weight: Float, law: Law) -> tuple[Float, Float]:
     return rough, reflected
 
 
+def fit_error(specular_weight: Float, law: Law) -> float:
+    """Root mean square difference between lobes with weights (n, lobes[, 3]) of a law and glTF's, over the lobes' own root mean square,
+    over all n and the directions of the fit; 0 without lobes."""
+    weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None].repeat(3, -1)
+    if not weight.any():
+        return 0.0
+    alpha, alike, length = _alike(law)
+    rough, reflected = glossy(weight, law)
+    chosen = np.abs(alpha - rough[:, None] ** 2).argmin(1)
+    # |L w - F g|^2 with the columns L of our lobes and glTF's g: their products among each other are known.
+    ours = np.einsum("nkc,km,nmc->", weight, _among(law), weight)
+    both = np.einsum("nkc,nk,nc->", weight, (alike * length).T[chosen], reflected)
+    theirs = np.einsum("nc,n->", reflected**2, length[chosen] ** 2)
+    return float(np.sqrt(max(ours - 2 * both + theirs, 0.0) / ours))
+
+
+@lru_cache(maxsize=8)
+def _among(law: Law) -> Float:
+    """(lobes, lobes) products of the lobes over the directions of the fit."""
+    ours = _lobes(law, *_directions())
+    products: Float = ours.T @ ours
+    return products
+
+
+def _lobes(law: Law, n_dot_l: Float, _: Float, h_dot_n: Float, h_dot_v: Float, share: Float) -> Float:
+    """(n, lobes) of the directions, by their share."""
+    return lobes_of(h_dot_n, law) * (share * n_dot_l / h_dot_v**2)[:, None]
+
+
 @lru_cache(maxsize=8)
 def _alike(law: Law) -> tuple[Float, NDArray[np.float32], NDArray[np.float32]]:
     """alpha (ALPHAS,) that are tried; M (lobes, ALPHAS); |pi D V| (ALPHAS,)."""
-    n_dot_l, n_dot_v, h_dot_n, h_dot_v, share = _directions()
+    n_dot_l, n_dot_v, h_dot_n, _, share = directions = _directions()
     widest, sharpest = (np.sqrt(2 / s) for s in (min(law.sharpness), max(law.sharpness)))
     alpha = np.geomspace(np.clip(sharpest / 2, SMOOTHEST, 1), np.clip(2 * widest, SMOOTHEST, 1), ALPHAS)
-    ours = lobes_of(h_dot_n, law) * (share * n_dot_l / h_dot_v**2)[:, None]
+    ours = _lobes(law, *directions)
     square = alpha**2
     smith = [x[:, None] + np.sqrt(square + (1 - square) * x[:, None] ** 2) for x in (n_dot_l, n_dot_v)]
     ggx = square / (h_dot_n[:, None] ** 2 * (square - 1) + 1) ** 2 / (smith[0] * smith[1]) * (share * n_dot_l)[:, None]

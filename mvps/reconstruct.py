@@ -145,6 +145,7 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     from mvps.export import write_reconstruction
     from mvps.joint.thinned import thinned
     from mvps.mesh import decimated
+    from mvps.pbr import fit_error
     from mvps.report import report_html
     from mvps.texture import bake
 
@@ -156,6 +157,8 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
         surface = reconstruction.surface
         shells = {faces: shell for faces in settings.faces if (shell := decimated(surface, faces)) is not None}
         textures, *levels = bake(surface, reconstruction.material, lights, part, density, tuple(shells.values()))
+        off = fit_error(reconstruction.material.specular_weight, reconstruction.material.law)
+        stage.status(f"glTF's highlights are {100 * off:.0f} % off ours" if off else "no highlights")
         if len(shells) < len(settings.faces):
             stage.status("no models of fewer faces: the mesh has an edge of more than two")
     metrics = {**reconstruction.metrics, "stages": progress.stages}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from references import linear_from_srgb
 
 from mvps.mesh import normalise
-from mvps.pbr import glossy, reflectance_scale, specular_energy, srgb_bytes
+from mvps.pbr import fit_error, glossy, reflectance_scale, specular_energy, srgb_bytes
 from mvps.scene import Law, Material
 
 
@@ -100,3 +100,16 @@ def test_srgb_round_trip_and_known_values() -> None:
     np.testing.assert_array_equal(srgb_bytes(linear_from_srgb(codes)), codes)
     # IEC 61966-2-1: middle grey of 18 % and 21.4 %; out of range is clipped.
     np.testing.assert_array_equal(srgb_bytes(np.array([-1, 0, 0.18, 0.214041, 1, 7])), [0, 0, 118, 127, 255, 255])
+
+
+def test_the_fit_says_how_far_it_is_off() -> None:
+    """Of one lobe of microfacets next to nothing, of a wide and a narrow one together much; no colour and no scale changes it."""
+    one, two = Law((200.0,), microfacet=True), Law((8.0, 500.0))
+    assert fit_error(np.zeros((4, 1)), one) == 0
+    assert fit_error(np.ones((4, 1)), one) < 0.1
+    mixed = np.array([[0.2, 1.0]])
+    off = fit_error(mixed, two)
+    assert 0.1 < off < 0.9
+    assert fit_error(7 * mixed, two) == pytest.approx(off, rel=1e-4)
+    coloured = mixed[..., None] * np.array([1.0, 0.5, 0.1])
+    assert fit_error(coloured, two) == pytest.approx(off, rel=1e-3)
