@@ -7,6 +7,7 @@ photographs stand beside: one is chosen, and the model takes its camera and its 
 
 from __future__ import annotations
 
+import json
 from argparse import SUPPRESS
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -59,7 +60,8 @@ class Model:
         from mvps.viewer import STYLE, viewer_html
 
         part = viewer_html(self._result.surface, self._result.material, self._up, self._towards, True, tuple(self._environments))
-        body = f"{part}\n{self._photographs()}"
+        beside = self._photographs()
+        body = f'<div class="beside"><div>{part}</div><div>{beside}</div></div>' if beside else part
         head = (
             f'<head><meta charset="utf-8"><link rel="icon" href="data:,"><title>mvps.view</title><style>{PAGE_STYLE}{STYLE}</style></head>'
         )
@@ -69,23 +71,31 @@ class Model:
         if not self._views:
             return ""
         result = self._result
-        options = []
+        options, cameras = [], {}
         for name, view in self._views.items():
-            place = result.views.index(name)
+            place, camera = result.views.index(name), view.camera
+            cameras[name] = {
+                "eye": camera.centre.tolist(),
+                "forward": camera.rotation[2].tolist(),
+                "above": (-camera.rotation[1]).tolist(),
+                "focal": [camera.K[0, 0], camera.K[1, 1]],
+                "middle": [camera.K[0, 2], camera.K[1, 2]],
+                "size": [camera.width, camera.height],
+            }
             for number in view.lights:
                 if number not in result.light_names[place]:
                     continue
                 light = result.lights.direction[place][result.light_names[place].index(number)]
-                said = ";".join(",".join(f"{x:.6f}" for x in v) for v in (-view.camera.rotation[2], light))
+                said = ",".join(f"{x:.6f}" for x in light)
                 options.append(f'<option value="{name}/{number}|{said}">{name}, light {number}</option>')
         return (
             f'<p><label>Photograph <select id="photograph">{"".join(options)}</select></label></p>'
-            '<img id="beside" alt="the photograph" style="max-width:24rem">'
-            "<script>(() => { const list = document.getElementById('photograph');"
+            '<img id="beside" alt="the photograph" style="width:100%">'
+            f"<script>(() => {{ const list = document.getElementById('photograph'), cameras = {json.dumps(cameras)};"
             "const show = () => { const [name, said] = list.value.split('|');"
             "document.getElementById('beside').src = 'photograph?of=' + name;"
-            "const [from, light] = said.split(';').map((v) => v.split(',').map(Number));"
-            "if (window.mvpsViewer) { window.mvpsViewer.look(from); window.mvpsViewer.lightFrom(light); } };"
+            "if (!window.mvpsViewer) return; window.mvpsViewer.look(cameras[name.split('/')[0]]);"
+            "window.mvpsViewer.lightFrom(said.split(',').map(Number)); };"
             "list.addEventListener('input', show); show(); })();</script>"
         )
 

@@ -75,10 +75,16 @@ def address(scene: SphereScene) -> Iterator[str]:
         serving.shutdown()
 
 
-def test_the_server_shows_the_page_and_photographs(address: str) -> None:
+def test_the_server_shows_the_page_and_photographs(address: str, scene: SphereScene) -> None:
     page = urlopen(f"{address}/").read().decode()
     assert '"served": true' in page and "view_02, light 3" in page
     assert urlopen(f"{address}/photograph?of=view_02/3").read()[:2] == b"\xff\xd8"
+    # The page's cameras are the photographs'.
+    told = json.JSONDecoder().raw_decode(page, page.index("cameras = ") + len("cameras = "))[0]["view_02"]
+    camera = scene.capture.views[1].camera
+    np.testing.assert_allclose(told["eye"], camera.centre)
+    np.testing.assert_allclose([told["forward"], told["above"]], [camera.rotation[2], -camera.rotation[1]])
+    assert told["focal"] + told["middle"] == [*camera.K.diagonal()[:2], *camera.K[:2, 2]] and told["size"] == [camera.width, camera.height]
 
 
 def test_the_server_traces_shadows(address: str, scene: SphereScene) -> None:

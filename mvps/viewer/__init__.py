@@ -139,5 +139,6 @@ def viewer_html(
 STYLE = (
     ".viewer canvas{width:100%;max-width:48rem;aspect-ratio:4/3;background:#222;touch-action:none;display:block;cursor:grab}"
     ".viewer-controls label{margin-right:1.2em;white-space:nowrap}"
+    ".beside{display:flex;flex-wrap:wrap;gap:1rem}.beside>div{flex:1 1 20rem;min-width:0}"
 )
 """Of the part, for the page's style sheet."""

@@ -41,6 +41,8 @@
   const radius = Math.hypot(...about.low.map((x, i) => about.high[i] - x)) / 2;
   const up = unit(about.up);
   let from = unit(about.from), distance = 4.2 * radius;
+  // A photograph's camera, until the object is turned: eye, forward, above (world); focal, middle, size (pixels, x and y).
+  let camera = null;
   const aside = cross(up, from);
   const placed = [[0.5, 0.5], [0.5, -0.8], [-0.3, 0.9], [1.2, 0]].map(([high, right]) => unit(add(add(from, up, high), aside, right)));
   // colour: linear, the strength included.
@@ -190,14 +192,23 @@
       });
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     }
-    const eye = add(centre, from, distance), near = Math.max(distance - 1.1 * radius, 0.01 * radius), far = distance + 1.1 * radius;
+    const eye = camera ? camera.eye : add(centre, from, distance), away = camera ? Math.hypot(...add(eye, centre, -1)) : distance;
+    const near = Math.max(away - 1.1 * radius, 0.01 * radius), far = away + 1.1 * radius;
     const focal = 1 / Math.tan(0.26), aspect = across / down;
     const lens = [focal / Math.max(aspect, 1), 0, 0, 0, 0, focal * Math.min(aspect, 1), 0, 0, 0, 0, -(far + near) / (far - near), -1, 0, 0, -2 * far * near / (far - near), 0];
     if (aspect >= 1) { lens[0] = focal / aspect; lens[5] = focal; }
+    if (camera) {
+      // The whole photograph fits into the canvas: so many canvas halves to a pixel.
+      const wide = 2 / Math.max(camera.size[1] * aspect, camera.size[0]), high = wide * aspect;
+      lens[0] = wide * camera.focal[0];
+      lens[5] = high * camera.focal[1];
+      lens[8] = -wide * (camera.middle[0] - camera.size[0] / 2);
+      lens[9] = high * (camera.middle[1] - camera.size[1] / 2);
+    }
     gl.viewport(0, 0, across, down);
     gl.clearColor(0.13, 0.13, 0.13, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    common(shown, product(lens, looking(eye, from.map((x) => -x), up)));
+    common(shown, product(lens, camera ? looking(eye, camera.forward, camera.above) : looking(eye, from.map((x) => -x), up)));
     set(shown, "eye", "3fv", eye);
     set(shown, "light", "3fv", lights.flatMap((light) => light.direction));
     set(shown, "lamp", "3fv", lights.flatMap((light) => light.colour));
@@ -277,7 +288,13 @@
   };
 
   // ---- hands ----
+  const leave = () => {
+    if (!camera) return;
+    const aside = add(camera.eye, centre, -1);
+    [from, distance, camera] = [unit(aside), Math.min(Math.max(Math.hypot(...aside), 1.2 * radius), 20 * radius), null];
+  };
   const move = (x, y, ofLight) => {
+    if (!ofLight) leave();
     const right = unit(cross(up, from));
     if (ofLight) {
       const above = cross(from, right);
@@ -305,6 +322,7 @@
   canvas.addEventListener("contextmenu", (e) => e.preventDefault());
   canvas.addEventListener("wheel", (e) => {
     e.preventDefault();
+    leave();
     distance = Math.min(Math.max(distance * Math.exp(e.deltaY / 800), 1.2 * radius), 20 * radius);
     later();
   }, { passive: false });
@@ -350,7 +368,7 @@
   ["viewer-environment", "viewer-turn"].forEach((name) => byId(name)?.addEventListener("change", () => surround().catch(failed)));
   new ResizeObserver(later).observe(canvas);
   window.mvpsViewer = {
-    look: (direction) => { from = unit(direction); later(); },
+    look: (through) => { camera = through; from = through.forward.map((x) => -x); later(); },
     lightFrom: (direction) => { lights[chosen].direction = unit(direction); ask(chosen).catch(failed); later(); },
   };
   ask(0).catch(failed);
