@@ -34,7 +34,7 @@ FILE_LIMIT = 1 << 30
 TEXT_LIMIT = 1 << 20
 """Most bytes of a text: names or numbers of ten thousand lights take less."""
 
-UNCHECKED_BYTES = 1 << 26
+UNCHECKED_BYTES = 1 << 24
 """Decoded bytes that any file may ask for: the decoder holds them twice, for each of two cores."""
 
 MOST_PACKED = 100
