@@ -174,13 +174,12 @@ def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
 
 
 def _without_gaps(scaled: Float) -> Float:
-    """(lights, 3) in which lights that no sample speaks of stand at the camera, with the median intensity: something finite that nothing
-    weighs."""
+    """(lights, 3) in which lights that no sample speaks of stand at the camera, with the median intensity (one where it is none's):
+    something finite that nothing weighs."""
     length = np.linalg.norm(scaled, axis=1)
-    known = length > 1e-9 * length.max(initial=0)
-    if known.all() or not known.any():
-        return scaled
-    return np.where(known[:, None], scaled, np.array([0.0, 0.0, -1.0]) * np.median(length[known]))
+    known = length > 1e-9 * np.nanmax(length, initial=0)
+    usual = np.median(length[known]) if known.any() else 1.0
+    return np.where(known[:, None], scaled, np.array([0.0, 0.0, -1.0]) * usual)
 
 
 def _from_normals(sample: _Sampled) -> Float:

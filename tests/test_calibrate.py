@@ -9,6 +9,7 @@ import pytest
 import torch
 from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
+from mvps import calibrate
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
 from mvps.hull import bounds, default_cells, signed_distance, visual_hull
 from mvps.mesh import normalise
@@ -183,3 +184,13 @@ def test_a_dark_pixel_faces_the_camera_without_confidence(scene: SphereScene) ->
     maps = normal_map(replace(view, samples=black), lights.direction[0], lights.intensity[0], CPU)
     assert (maps.confidence[:5] == 0).all() and (degrees(maps.normal[:5], -view.camera.rotation[2]) < 15).all()
     assert np.isfinite(maps.albedo).all()
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_lights_of_which_nothing_is_known_stand_at_the_camera(nothing: float) -> None:
+    """Of a view without a usable sample all are such; no number comes of the others."""
+    toward = [0.0, 0.0, -1.0]
+    none = calibrate._without_gaps(np.full((3, 3), nothing))
+    np.testing.assert_array_equal(none, [toward] * 3)
+    some = calibrate._without_gaps(np.array([[0.0, 2.0, 0.0], [nothing] * 3]))
+    np.testing.assert_array_equal(some, [[0, 2, 0], [0, 0, -2]])
