@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 NEEDED = 1.6e9
-"""Bytes. All libraries map 1.0e9 (PyTorch for the CPU, two cores), and their buffers come on top: 1.11e9 and 1.18e9 ended in OpenBLAS, 1.30e9
-to 1.45e9 in the ray tracer, which does not ask whether it got its memory."""
+"""Bytes. All libraries map 1.0e9 (PyTorch for the CPU, two cores), and their buffers come on top: 1.11e9 and 1.18e9 ended in OpenBLAS,
+1.30e9 to 1.45e9 in the ray tracer, which does not ask whether it got its memory."""
 
 
 def refused(limit: int) -> str:
