@@ -103,7 +103,8 @@ def region_of(surface: Surface, material: Material, region: Any, cameras: Mappin
             raise ValueError(f"cluster {kind} of {of}")
         return np.asarray(clusters(material, of) == kind - 1)
     camera, mask = _camera(cameras, region["view"]), read_mask(Path(region["mask"]))
-    _check_size(region["mask"], mask.shape, camera)
+    if mask.shape != (camera.height, camera.width):
+        raise CaptureError(f"{region['mask']}: wanted {camera.width} x {camera.height} pixels, given {mask.shape[1]} x {mask.shape[0]}")
     seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera))
     column, row = np.floor(project(camera, surface.vertices[seen])[0]).astype(int).T
     chosen = np.zeros(len(surface.vertices), bool)
@@ -116,11 +117,6 @@ def _camera(cameras: Mapping[str, Camera], name: Any) -> Camera:
         known = f"among {', '.join(cameras)}" if cameras else "of the photographs"
         raise CaptureError(f"edit: wanted a view {known}, given {name!r}; give --capture for its views")
     return cameras[name]
-
-
-def _check_size(path: str, shape: tuple[int, ...], camera: Camera) -> None:
-    if shape[:2] != (camera.height, camera.width):
-        raise CaptureError(f"{path}: wanted {camera.width} x {camera.height} pixels, given {shape[1]} x {shape[0]}")
 
 
 def clusters(material: Material, count: int) -> Int:
@@ -157,8 +153,8 @@ def with_albedo(
 def with_painted(surface: Surface, material: Material, chosen: Bool, cameras: Mapping[str, Camera], painted: str, view: str) -> Material:
     """The material with the colours of a picture, sRGB, of the view's size, on the chosen vertices that the view's camera sees; what the
     picture has clear stays."""
-    camera, picture = _camera(cameras, view), read_painting(Path(painted))
-    _check_size(painted, picture.shape, camera)
+    camera = _camera(cameras, view)
+    picture = read_painting(Path(painted), camera.height, camera.width)
     seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera) & chosen)
     at = project(camera, surface.vertices[seen])[0]
     opacity = picture[..., 3:]

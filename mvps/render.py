@@ -221,8 +221,9 @@ def asks_for_own(given: Namespace) -> bool:
 
 def check_used(given: Namespace) -> None:
     """CaptureError about an option that a capture's views under their own lights have no use for."""
+    made = options()
     for name in ("size", "fov", "up", "elevation", "target", "frame", "envmap_turn", "envmap_lights"):
-        if name in given and getattr(given, name) != options().get_default(name):
+        if name in given and getattr(given, name) != made.get_default(name):
             raise CaptureError(
                 f"--{name.replace('_', '-')}: wanted together with a camera or a light of your own, given with a capture's views under"
                 " their own lights; leave it out"

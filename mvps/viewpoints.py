@@ -30,13 +30,12 @@ def look_at(eye: Float, target: Float, up: Float, width: int, height: int, field
 
     ValueError where the eye is at the target, or `up` is no direction.
     """
-    if lengths(np.asarray(up, float)) == 0:
-        raise ValueError(f"up: wanted a direction, given {tuple(np.asarray(up).tolist())}")
+    up = _upwards(up)
     if lengths(np.asarray(target, float) - eye) == 0:
         raise ValueError(f"camera: wanted an eye away from its target, given both at {tuple(np.asarray(eye).tolist())}")
     forward = normalise(np.asarray(target, float) - eye)
     right = np.cross(forward, up)
-    if lengths(right) < 1e-6 * lengths(np.asarray(up, float)):
+    if lengths(right) < 1e-6:
         # Straight up or down any direction will do.
         right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
     right = normalise(right)
@@ -44,6 +43,13 @@ def look_at(eye: Float, target: Float, up: Float, width: int, height: int, field
     focal = min(width, height) / 2 / np.tan(np.radians(field_of_view) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(K, rotation, -rotation @ np.asarray(eye, float), height, width)
+
+
+def _upwards(up: Float) -> Float:
+    """(3,) unit. ValueError where it is no direction."""
+    if lengths(np.asarray(up, float)) == 0:
+        raise ValueError(f"up: wanted a direction, given {tuple(np.asarray(up).tolist())}")
+    return normalise(np.asarray(up, float))
 
 
 def ball_around(surface: Surface) -> tuple[Float, float]:
@@ -57,9 +63,7 @@ def turntable(
 ) -> list[Camera]:
     """Cameras evenly around the surface, so far away that it just fills the image from everywhere."""
     centre, radius = ball_around(surface)
-    if lengths(np.asarray(up, float)) == 0:
-        raise ValueError(f"up: wanted a direction, given {tuple(np.asarray(up).tolist())}")
-    up = normalise(np.asarray(up, float))
+    up = _upwards(up)
     first = normalise(np.cross(up, np.eye(3)[np.abs(up).argmin()]))
     second = np.cross(up, first)
     distance = MARGIN * radius / np.sin(np.radians(field_of_view) / 2)

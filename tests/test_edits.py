@@ -82,7 +82,7 @@ def test_a_painted_picture_covers_what_its_camera_sees(tmp_path: Path) -> None:
     assert red.mean() > 0.1 and (local[red, 0] > 0).all() and (local[red, 2] < 0).all()
     assert same[local[:, 2] > 0].all() and same[local[:, 0] < -2].all() and (red | same).mean() > 0.9
     cv2.imwrite(str(tmp_path / "over.png"), picture[:-1])
-    with pytest.raises(CaptureError, match=r"over.png: wanted \d+ x \d+ pixels"):
+    with pytest.raises(CaptureError, match=r"over.png: wanted a painted picture as PNG, \d+ x \d+ pixels, given"):
         edited(SURFACE, MATERIAL, read_edits(path), CAMERAS)
 
 

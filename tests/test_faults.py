@@ -8,6 +8,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -80,6 +81,21 @@ def test_allocators_say_what_is_looked_for(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EFBIG, errno.EROFS])
 def test_no_room(code: int, capsys: pytest.CaptureFixture[str]) -> None:
     assert f"writing a file: {os.strerror(code)}; make room" in said_by(OSError(code, os.strerror(code)), capsys)
+
+
+def test_no_room_for_an_array(capsys: pytest.CaptureFixture[str]) -> None:
+    """numpy writes arrays itself: a file that may not grow makes it raise an error without a number."""
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with tempfile.TemporaryFile() as file:
+        before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit[1]))
+        try:
+            with pytest.raises(OSError) as caught:
+                np.save(file, np.zeros(10_000))
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+            signal.signal(signal.SIGXFSZ, before)
+    assert "writing a file: " in (said := said_by(caught.value, capsys)) and "make room" in said
 
 
 def test_names_do_not_move_the_cursor(capsys: pytest.CaptureFixture[str]) -> None:

@@ -123,21 +123,26 @@ def _fault(data: bytes) -> str:
 
 def decode(path: Path, header: Header) -> NDArray[Any]:
     """(height, width, 3) RGB code values, uint8 or uint16 as stored; grey is repeated thrice, transparency dropped."""
-    image = _decoded(path, header, "a photograph as PNG")
-    return np.broadcast_to(image, (*header[:2], 3)) if image.shape[2] == 1 else image[..., 2::-1]
+    return _colours(_decoded(path, header, "a photograph as PNG"))
 
 
-def read_painting(path: Path) -> NDArray[np.float32]:
-    """(height, width, 4) red, green, blue and opacity of a painted picture, code values over full scale."""
-    wanted = "a painted picture as PNG"
+def read_painting(path: Path, height: int, width: int) -> NDArray[np.float32]:
+    """(height, width, 4) red, green, blue and opacity of a painted picture of this size, code values over full scale."""
+    wanted = f"a painted picture as PNG, {width} x {height} pixels"
     header = read_header(path, wanted)
-    check_packing(path, header)
+    # Before it is decoded: what is mostly clear packs as well as what is made to fill the memory.
+    if header[:2] != (height, width):
+        raise complaint(path, wanted, f"{header.width} x {header.height}", "paint over a picture of that view")
     image = _decoded(path, header, wanted)
     full = np.float32(65535 if header.bits == 16 else 255)
-    colour = np.broadcast_to(image, (*header[:2], 3)) if image.shape[2] == 1 else image[..., 2::-1]
     opacity = image[..., 3:] if image.shape[2] == 4 else np.full((*header[:2], 1), full)
-    painted: NDArray[np.float32] = np.concatenate([colour, opacity], 2).astype(np.float32) / full
+    painted: NDArray[np.float32] = np.concatenate([_colours(image), opacity], 2).astype(np.float32) / full
     return painted
+
+
+def _colours(image: NDArray[Any]) -> NDArray[Any]:
+    """(height, width, 3) red, green, blue of what `_decoded` gives."""
+    return np.broadcast_to(image, (*image.shape[:2], 3)) if image.shape[2] == 1 else image[..., 2::-1]
 
 
 def _decoded(path: Path, header: Header, wanted: str) -> NDArray[Any]:
