@@ -5,6 +5,10 @@ from __future__ import annotations
 import csv
 import json
 import shutil
+import signal
+import subprocess
+import sys
+import time
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -66,6 +70,18 @@ def test_what_is_there_is_not_run_again(capture: Path, compared: Path) -> None:
     assert (compared / "hull" / "mesh.ply").stat().st_mtime_ns == before and json.loads((compared / "runs.json").read_text()) == runs
     assert run(main, [str(capture), "--methods", "hull", "--out", str(compared), "--quiet"]) == 0
     assert (compared / "hull" / "mesh.ply").stat().st_mtime_ns > before
+
+
+def test_a_comparison_that_is_ended_ends_its_method_and_goes_on_later(capture: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mvps.compare", str(capture), "--methods", "hull", "--out", str(tmp_path / "out"), "--quiet"]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    end = time.monotonic() + 60
+    while not (child := children.read_text().split()) and time.monotonic() < end:
+        time.sleep(0.02)
+    process.terminate()
+    assert process.wait(60) == 128 + signal.SIGTERM and child and not Path(f"/proc/{child[0]}").exists()
+    assert run(main, command[3:]) == 0 and (tmp_path / "out" / "hull" / "mesh.ply").is_file()
 
 
 def test_another_capture_is_not_told_anothers_figures(capture: Path, tmp_path: Path) -> None:
