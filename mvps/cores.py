@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
+MANY_POINTS = 1 << 14
+"""Below, starting threads takes longer than looking for points' neighbours (about 2 microseconds each)."""
+
 _most = [len(os.sched_getaffinity(0))]
 
 
@@ -62,8 +65,11 @@ def one_by_one(task: Callable[[int], Result], total: int) -> Iterator[Result]:
 
 
 def neighbours(tree: cKDTree, points: NDArray[Any], k: int = 1, p: float = 2) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Distance and index (n,), or (n, k), of the tree's points nearest to points (n, 3), in the p-norm, on all cores. (The tree's own
-    threads are abandoned by an interruption, and abort the process when it ends.)"""
+    """Distance and index (n,), or (n, k), of the tree's points nearest to points (n, 3), in the p-norm, on all cores where there are many
+    points. (The tree's own threads are abandoned by an interruption, and abort the process when it ends.)"""
+    if len(points) < MANY_POINTS:
+        few: tuple[NDArray[Any], NDArray[Any]] = tree.query(points, k=k, p=p)
+        return few
     parts = on_cores(lambda some: tree.query(some, k=k, p=p), np.array_split(points, at_a_time()))
     distance, index = (np.concatenate(values) for values in zip(*parts, strict=True))
     return distance, index

@@ -58,8 +58,7 @@ class Parts:
 def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     """Rounds on the hull: lights and normals good enough for Stage I, or all there is (final). Sweeps reach as far as a hull bulges over
     shallow hollows."""
-    edge = 2.7 if final else 3.0
-    rounds = (RoundSettings(edge, 4.0, 0.5, photometric=False), RoundSettings(edge, 2.0, 0.4))
+    rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(3.0, 2.0, 0.4))
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True, detail=final)
 
 

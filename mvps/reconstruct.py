@@ -37,6 +37,9 @@ TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
 
+FEWER_LIGHTS = {"draft": 2, "standard": 1, "fine": 1}
+"""How many times fewer lights of a view tell its pixels' albedo than tell their six unknowns (mvps/joint/thinned.py)."""
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -152,7 +155,7 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     with progress.stage("textures") as stage:
         # A texel is seen by several views: their kept lights together determine its albedo several times over.
-        part, lights = thinned(used, lights_of(reconstruction, used))
+        part, lights = thinned(used, lights_of(reconstruction, used), FEWER_LIGHTS[settings.preset])
         density = TEXELS_PER_PIXEL[settings.preset]
         surface = reconstruction.surface
         shells = {faces: shell for faces in settings.faces if (shell := decimated(surface, faces)) is not None}

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
 from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
-from mvps.cores import one_by_one
+from mvps.cores import on_cores, one_by_one
+from mvps.gleam import Senders
 from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
 from mvps.pbr import glossy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_senders, points_under, shadow_at, specular_shading
@@ -86,10 +87,14 @@ def bake(
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
     normal = normalise(vertex_normals(surface))
     levels = (surface, *shells)
-    charted = [_charted(surface, shell, pixel / texels_per_pixel) for shell in levels]
+    # Charts are cut on one core: meanwhile it is told what sends light to where.
+    charted, sent = on_cores(
+        lambda make: make(),
+        (lambda: [_charted(surface, shell, pixel / texels_per_pixel) for shell in levels], lambda: light_senders(surface, material)),
+    )
     places = [tuple(_at(source, surface, values) for values in (surface.vertices, normal)) for _, _, source in charted]
     position, outward = (np.concatenate(values) for values in zip(*places, strict=True))
-    albedo, seen = _photographed_albedo(surface, material, lights, capture, position, normalise(outward))
+    albedo, seen = _photographed_albedo(surface, material, lights, capture, sent, position, normalise(outward))
     ends = np.cumsum([len(source.face) for _, _, source in charted])
     made: list[Textures] = []
     for shell, (atlas, texels, source), end in zip(levels, charted, ends, strict=True):
@@ -227,10 +232,10 @@ def _at(texels: Texels, surface: Surface, values: Float) -> Float:
 
 
 def _photographed_albedo(
-    surface: Surface, material: Material, lights: Lights, capture: Capture, position: Float, normal: Float
+    surface: Surface, material: Material, lights: Lights, capture: Capture, sent: Senders | None, position: Float, normal: Float
 ) -> tuple[Float, Bool]:
     """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
-    caster, sent = ray_caster(surface), light_senders(surface, material)
+    caster = ray_caster(surface)
     total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
 
     def solved(i: int) -> list[tuple[Int, Float, Float]]:

@@ -337,3 +337,6 @@ def test_thinned_views_keep_other_lights_and_their_own_light(scene: SphereScene)
         rows = np.array(v.lights) - 1
         assert np.array_equal(d, direction[rows]) and np.array_equal(e, numbered[rows])
         assert np.array_equal(v.samples, many.samples[:, rows])
+    half = thinned(crowd, Lights((direction,) * 21, (numbered,) * 21, True), fewer=2)[0]
+    assert ENOUGH_LIGHTS / 2 <= min(len(v.lights) for v in half.views) <= min(sizes) / 2
+    assert {number for v in half.views for number in v.lights} == set(many.lights)
