@@ -102,8 +102,12 @@ def claims(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> list[list[str
 
 
 def verdict(runs: Runs) -> str:
-    """Which method has the lowest errors, and where a published one is faster than ours of the same accuracy."""
+    """Which method has the lowest errors and the highest F-score, and where a published one is faster than ours of the same accuracy."""
     lines = []
+    score = "f_score_0_5_mm"
+    highest = sorted((run for run in runs.values() if score in run.errors), key=lambda run: -run.errors[score])[:3]
+    if highest:
+        lines.append(f"highest {score}: " + ", ".join(f"{run.method} {run.errors[score]:.3f}" for run in highest))
     for key in MEASURES:
         best = sorted((run for run in runs.values() if key in run.errors), key=lambda run: run.errors[key])[:3]
         lines.append(f"lowest {key}: " + ", ".join(f"{run.method} {run.errors[key]:.3f}" for run in best))

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import fields, is_dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 import mvps
 import solvers
+from mvps.folders import replaced, write_whole
 from mvps.inputs import DAMAGED, JSON_LIMIT, check_npz, read_file
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError, Lights
@@ -133,18 +133,7 @@ class Checkpoints:
 
     def _write(self, path: Path, value: Any) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        _replaced(self._folder / RUN, lambda file: file.write(self._run.encode()))
+        write_whole(self._folder / RUN, self._run)
         arrays: dict[str, Any] = {}
         text = np.frombuffer(json.dumps(packed(value, arrays)).encode(), np.uint8)
-        _replaced(path, lambda file: np.savez(file, text=text, **arrays))
-
-
-def _replaced(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """The file with what `write` writes, whole or as it was."""
-    beside = path.with_name(f".{path.name}")
-    try:
-        with beside.open("wb") as file:
-            write(file)
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+        replaced(path, lambda file: np.savez(file, text=text, **arrays))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from argparse import SUPPRESS, ArgumentTypeError
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from mvps.command import parse, parser, run
+from mvps.folders import write_whole
 
 if TYPE_CHECKING:
     from mvps.scene import Capture, Reconstruction, Truth
@@ -150,12 +150,7 @@ def read_views(path: Path, reconstruction: Reconstruction, truth: Truth) -> Capt
 
 def write_json(path: Path, value: object) -> None:
     """The value as JSON, at its place whole or not at all."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_whole(path, json.dumps(value, indent=1, sort_keys=True, allow_nan=False) + "\n")
 
 
 def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours",), lpips_weights: Path | None = None) -> dict[str, float]:

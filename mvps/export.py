@@ -142,7 +142,7 @@ def check_account(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> No
     """ValueError where metrics or settings hold other kinds of values than the commands that read them take."""
     model = metrics.get("model") or {}
     records = [metrics.get("stages") or [], metrics.get("rounds") or [], model.get("components") or []]
-    texts = [metrics.get("status") or {}, model]
+    texts = [metrics.get("status") or {}, metrics.get("held_out") or {}, model]
     truth = metrics.get("truth") or {}
     if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in records) or not all(
         isinstance(value, dict) for value in texts

@@ -1,12 +1,13 @@
-"""Folders that appear whole: written beside their place, on the same file system, and renamed."""
+"""Folders and files that appear whole: written beside their place, on the same file system, and renamed."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from mvps.scene import CaptureError
 
@@ -45,6 +46,23 @@ def appearing_whole(folder: Path, marks: tuple[str, ...] = (), unfinished: str =
     finally:
         if writing.exists():
             shutil.rmtree(writing)
+
+
+def replaced(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """The file with what `write` writes, whole or as it was."""
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with beside.open("wb") as file:
+            write(file)
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """The file with this content (text as UTF-8), whole or as it was."""
+    data = content.encode("utf-8") if isinstance(content, str) else content
+    replaced(path, lambda file: file.write(data))
 
 
 def check_place(place: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 from mvps import __version__
@@ -104,6 +104,7 @@ def told(
     used: what it was made from; settings: plain values; complete, pictures: lights and normals of all views; findings: of the capture's
     checks; words: to end the verdict with.
     """
+    from mvps.measures import held_out_photographs, held_out_views, photograph_errors
     from mvps.nearness import nearness
     from mvps.verdict import signs, verdict
 
@@ -129,7 +130,7 @@ def told(
         "gleam": refined.law.gleam,
         "share_with_neural_residual": 0.0 if refined.material.residual is None else float(refined.material.residual.share.mean()),
     }
-    return Reconstruction(
+    result = Reconstruction(
         refined.surface,
         refined.material,
         complete,
@@ -139,3 +140,8 @@ def told(
         metrics,
         {**settings, "versions": versions()},
     )
+    photographs = held_out_photographs(result)
+    if not photographs:
+        return result
+    errors = photograph_errors(result.surface, result.material, photographs, capture, held_out_views(result))
+    return replace(result, metrics={**metrics, "held_out": errors})

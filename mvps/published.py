@@ -25,6 +25,12 @@ DILIGENT_VIEWS, DILIGENT_LIGHTS = 20, 96
 AVERAGE = "average"
 """Object of a figure that is the mean over all objects of its data."""
 
+ONE_RUN = "one"
+"""Object of a figure of a single run, whatever the object."""
+
+OTHERWISE = ("other", "time")
+"""Protocols of figures that `mvps.evaluate` does not measure."""
+
 
 @dataclass(frozen=True)
 class Figure:

@@ -100,6 +100,15 @@ def test_the_report_shows_the_model_without_a_server(
     assert np.abs(shown(page) - before).mean() < 0.1
     page.select_option("#viewer-layer", "normals")
     assert np.abs(shown(page) - lit).mean() > 5
+    picture = page.locator("main figure img").first
+    small = picture.bounding_box()["width"]
+    picture.click()
+    assert picture.bounding_box()["width"] > 2 * small
+    picture.click()
+    assert picture.bounding_box()["width"] == small
+    page.set_viewport_size({"width": 360, "height": 640})
+    places = [page.locator("main figure img").nth(k).bounding_box() for k in range(2)]
+    assert places[0]["y"] == places[1]["y"], "two pictures stand beside each other on a phone"
     assert not said
 
 

@@ -22,7 +22,7 @@ from mvps.compare.curve import Point, dominated, drawings, points_of, ticks
 from mvps.compare.page import page_html
 from mvps.compare.pictures import cropped, error_picture
 from mvps.compare.running import Run, known_runs
-from mvps.compare.tables import as_csv, as_markdown, as_text, protocol_rows, rows
+from mvps.compare.tables import as_csv, as_markdown, as_text, otherwise_rows, protocol_rows, rows
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -51,6 +51,9 @@ def test_table_pictures_and_meshes(compared: Path) -> None:
     picture = cv2.imread(str(compared / "normals.png"))
     assert picture is not None and picture.std() > 20
     assert (compared / "hull" / "mesh.ply").is_file()
+    # The result itself says how well it tells the photographs that were held out, and no truth is needed for it.
+    said = json.loads((compared / "ours-draft" / "metrics.json").read_text())["held_out"]["held_out_views_psnr_db"]
+    assert said == pytest.approx(known_runs(compared)["ours-draft"].errors["held_out_views_psnr_db"], abs=0.01)
     assert "| method |" in (compared / "table.md").read_text()
     page = (compared / "report.html").read_text()
     assert "<td>hull</td>" in page and "data:image/png;base64," in page and "<svg" not in page
@@ -155,6 +158,14 @@ def test_papers_figures_stand_beside_their_protocol_alone() -> None:
     assert {line[0] for line in protocol_rows("mvscps", runs, "BEAR")[1:]} == {"ours"}
 
 
+def test_what_papers_measured_otherwise_stands_by_itself() -> None:
+    lines = otherwise_rows("BEAR")
+    found = {(line[0], line[1]): line[2:] for line in lines[1:]}
+    assert found["RNb-NeuS2", "chamfer_mm"] == ["0.17", "mm", "Bruneau et al. (2025), average", "about; by a protocol of its own"]
+    assert found["PS-NeRF", "seconds"][0] == "79200"
+    assert not {line[1] for line in lines[1:]} & {"normal_error_deg", "chamfer"}, "these stand beside their protocols"
+
+
 def test_other_protocols_are_measured_without_running_again(capture: Path, compared: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(compared, out)
@@ -164,6 +175,9 @@ def test_other_protocols_are_measured_without_running_again(capture: Path, compa
     assert after.seconds == before.seconds and after.errors.items() > before.errors.items()
     table = list(csv.DictReader((out / "table_rnbneus.csv").read_text().splitlines()))
     assert [row["method"] for row in table][:2] == ["ours-draft", "PJ16"] and float(table[0]["Chamfer distance, mm"]) < 5
+    assert not (out / "table_otherwise.csv").exists()
+    assert run(main, [str(capture), *options[:-2], "--published", "BEAR"]) == 0
+    assert "19.58" in (out / "table_psnerf.csv").read_text() and "RNb-NeuS2" in (out / "table_otherwise.csv").read_text()
 
 
 def test_errors_are_seen_where_both_are_known() -> None:

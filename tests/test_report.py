@@ -98,7 +98,7 @@ def test_the_page_needs_nothing_else(html: str) -> None:
     page = Page(html)
     assert not page.open
     assert "http" not in html and "@import" not in html and "url(" not in html and "<link" not in html
-    assert all("src" not in script for script in page.all("script")) and len(page.all("script")) == 3
+    assert all("src" not in script for script in page.all("script")) and len(page.all("script")) == 4
     assert all(image["src"].startswith("data:image/jpeg;base64,") for image in page.all("img"))  # type: ignore[union-attr]
     assert len(html) < 15e6
     assert any(meta.get("name") == "viewport" for meta in page.all("meta"))
@@ -145,6 +145,12 @@ def test_numbers_are_shown(html: str) -> None:
         *("Views", "Lights", "Settings", *SECTIONS.values()),
     ):
         assert shown in text.replace("  ", " "), shown
+
+
+def test_held_out_photographs_are_told(scene: SphereScene) -> None:
+    metrics = {"held_out": {"held_out_views_psnr_db": 31.5, "photograph_scale": 1.0}}
+    text = words(report_html(replace(scene.reconstruction, metrics=metrics), scene.capture))
+    assert "of views that were held back, against the model: mean PSNR inside the mask 31.5 dB" in text and "lights that were" not in text
 
 
 @pytest.mark.parametrize("missing", SECTIONS)

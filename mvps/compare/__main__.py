@@ -9,6 +9,7 @@ from typing import Any
 
 from mvps.command import parse, parser, run
 from mvps.evaluate import PROTOCOLS, protocol_list
+from mvps.folders import write_whole
 from mvps.methods import BUDGETS, METHODS, OPTIONS, listed_methods
 from mvps.progress import Progress
 from mvps.published import AVERAGE, DILIGENT_OBJECTS, diligent_object
@@ -56,7 +57,7 @@ def write_pictures(capture: Path, methods: Sequence[str], out: Path) -> None:
     view = common[0]
     box = cropped(truth[view])
     maps = {name: result.normal_maps[result.views.index(view)][box] for name, result in found.items()}
-    (out / "normals.png").write_bytes(png_bytes(side_by_side(truth[view][box], maps)))
+    write_whole(out / "normals.png", png_bytes(side_by_side(truth[view][box], maps)))
 
 
 def main(argv: Sequence[str]) -> None:
@@ -74,38 +75,44 @@ def main(argv: Sequence[str]) -> None:
     for name, (kind, _, words) in OPTIONS.items():
         made.add_argument(f"--{name}", type=checked(kind), default=SUPPRESS, help=words)
     made.add_argument(
-        "--protocols", type=protocol_list, default="ours", metavar="NAMES", help=f"how to measure: all, or some of {', '.join(PROTOCOLS)}"
+        "--protocols",
+        type=protocol_list,
+        metavar="NAMES",
+        help=f"how to measure: all, or some of {', '.join(PROTOCOLS)}; ours if not given, all beside what papers printed",
     )
     made.add_argument(
         "--published",
         choices=(*DILIGENT_OBJECTS, AVERAGE),
-        help="object of DiLiGenT-MV whose printed figures stand beside; the capture's own where it is one of them, else the average",
+        help="object of DiLiGenT-MV whose printed figures stand beside, or their average; the capture's own where it is one of them",
     )
     given = parse(made, argv)
     from mvps.compare.curve import drawings
     from mvps.compare.page import page_html
     from mvps.compare.running import run_all
-    from mvps.compare.tables import heading, protocol_rows, rows, write_tables
+    from mvps.compare.tables import heading, otherwise_rows, protocol_rows, rows, write_tables
 
     texts = {name: getattr(given, name.replace("-", "_"), None) for name in OPTIONS}
     options = [f"--{name}={text}" for name, text in texts.items() if text is not None]
     methods = tuple(dict.fromkeys((*given.methods, *(BUDGETS if given.curve else ()))))
-    runs = run_all(given.capture, methods, options, given.out, Progress(), given.protocols)
+    printed = given.published or diligent_object(given.capture.name, *capture_size(given.capture))
+    protocols = given.protocols or (tuple(PROTOCOLS) if printed else ("ours",))
+    runs = run_all(given.capture, methods, options, given.out, Progress(), protocols)
     chosen = [runs[name] for name in methods]
     if all(one.failed for one in chosen):
         raise CaptureError(chosen[0].failed)
     curves = drawings(chosen) if given.curve else {}
     for key, text in curves.items():
-        (given.out / f"curve_{key}.svg").write_text(text, encoding="utf-8")
+        write_whole(given.out / f"curve_{key}.svg", text)
     done = [one for one in chosen if not one.failed]
     write_pictures(given.capture, [one.method for one in done], given.out)
-    printed = given.published or diligent_object(given.capture.name, *capture_size(given.capture)) or AVERAGE
-    tables = {"ours": rows(chosen)} | {name: protocol_rows(name, done, printed) for name in given.protocols if name != "ours"}
+    tables = {"ours": rows(chosen)} | {name: protocol_rows(name, done, printed or AVERAGE) for name in protocols if name != "ours"}
+    if printed:
+        tables["otherwise"] = otherwise_rows(printed)
     print(write_tables(tables, given.out))
     picture = given.out / "normals.png"
     headed = {heading(name): lines for name, lines in tables.items()}
     page = page_html(given.capture.name, headed, curves, picture.read_bytes() if picture.exists() else None)
-    (given.out / "report.html").write_text(page, encoding="utf-8")
+    write_whole(given.out / "report.html", page)
 
 
 if __name__ == "__main__":

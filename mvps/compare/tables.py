@@ -10,7 +10,8 @@ from typing import NamedTuple
 
 from mvps.compare.running import Run
 from mvps.evaluate import PROTOCOLS, ROWS, write_json
-from mvps.published import DILIGENT_MV, published
+from mvps.folders import write_whole
+from mvps.published import AVERAGE, DILIGENT_MV, ONE_RUN, OTHERWISE, figures, published
 
 
 class Column(NamedTuple):
@@ -62,6 +63,16 @@ def protocol_rows(protocol: str, runs: Sequence[Run], printed: str) -> list[list
     return lines
 
 
+def otherwise_rows(printed: str) -> list[list[str]]:
+    """What papers printed of DiLiGenT-MV's object `printed`, or "average", that no protocol of `mvps.evaluate` measures: by protocols of
+    their own, and times. A row each, for no two are to be compared."""
+    lines = [["method", "what", "value", "unit", "source", "note"]]
+    for one in figures():
+        if one.data == DILIGENT_MV and one.protocol in OTHERWISE and one.object in (printed, AVERAGE, ONE_RUN):
+            lines.append([one.method, one.metric, f"{one.value:g}", one.unit, f"{one.source}, {one.object}", one.note])
+    return lines
+
+
 def as_text(lines: list[list[str]]) -> str:
     """Columns of equal width."""
     width = [max(len(line[k]) for line in lines) for k in range(len(lines[0]))]
@@ -86,15 +97,15 @@ def as_csv(lines: list[list[str]]) -> str:
 
 def heading(protocol: str) -> str:
     """The protocol with what it measures."""
-    return f"{protocol}: {PROTOCOLS[protocol]}"
+    return f"{protocol}: {PROTOCOLS.get(protocol, 'what papers printed of DiLiGenT-MV, measured by none of these protocols')}"
 
 
 def write_tables(tables: Mapping[str, list[list[str]]], out: Path) -> str:
     """Tables by protocol as table.md, table.json and a CSV each (table.csv by our own measures, table_PROTOCOL.csv) in `out`; as text."""
     for name, lines in tables.items():
-        (out / ("table.csv" if name == "ours" else f"table_{name}.csv")).write_text(as_csv(lines), encoding="utf-8")
+        write_whole(out / ("table.csv" if name == "ours" else f"table_{name}.csv"), as_csv(lines))
     records = {name: [dict(zip(lines[0], line, strict=True)) for line in lines[1:]] for name, lines in tables.items()}
     write_json(out / "table.json", records)
     page = "\n\n".join(f"## {heading(name)}\n\n{as_markdown(lines)}" for name, lines in tables.items())
-    (out / "table.md").write_text(page + "\n", encoding="utf-8")
+    write_whole(out / "table.md", page + "\n")
     return "\n\n".join(f"{heading(name)}\n{as_text(lines)}" for name, lines in tables.items())

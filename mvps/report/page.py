@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.cores import on_cores
+from mvps.folders import write_whole
 from mvps.rendering import light_senders
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
@@ -21,13 +21,22 @@ from mvps.visibility import ray_caster
 
 VIEWS_SHOWN = 4
 
+ENLARGE = """
+for(const button of document.querySelectorAll(".enlarge"))button.addEventListener("click",()=>{
+const large=button.parentElement.classList.toggle("large");button.setAttribute("aria-expanded",large);
+if(large)button.scrollIntoView({block:"nearest"})})
+"""
+"""A picture that is clicked takes the page's whole width, or its place again."""
+
 STYLE = """
 :root{color-scheme:light dark;--ink:#1c1c1c;--paper:#fff;--line:#d0d0d0;--soft:#f3f3f1;--mark:#b4501e}
 @media(prefers-color-scheme:dark){:root{--ink:#e8e8e8;--paper:#161616;--line:#444;--soft:#222;--mark:#f0904f}}
 body{font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--paper);margin:0 auto;max-width:72rem;padding:1rem}
 h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
 .status{padding:.7em 1em;background:var(--soft);border-left:4px solid var(--mark)}
-.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(10rem,1fr));gap:.6rem}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(8rem,1fr));gap:.6rem}
+.grid .large{grid-column:1/-1}
+.enlarge{display:block;width:100%;padding:0;border:0;background:none;cursor:zoom-in}.large .enlarge{cursor:zoom-out}
 figure{margin:0}figure img{width:100%;height:auto;display:block}figcaption{font-size:.85rem}
 .spheres{grid-template-columns:repeat(auto-fill,minmax(12rem,1fr))}.sphere{max-width:20rem}
 .wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
@@ -47,12 +56,7 @@ CALIBRATION = ("confidence_stated_", "confidence_measured_")
 
 def write_report(reconstruction: Reconstruction, capture: Capture, path: Path) -> None:
     """Write the page of a reconstruction and the capture it was made from (or part of it) to `path`, whole or not at all."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        beside.write_text(report_html(reconstruction, capture), encoding="utf-8")
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    write_whole(path, report_html(reconstruction, capture))
 
 
 def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
@@ -62,7 +66,7 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
         _heading(reconstruction, capture),
         _viewer(reconstruction, capture),
         _findings(metrics.get("findings") or []),
-        _signs(metrics.get("status") or {}),
+        _signs(metrics.get("status") or {}, metrics.get("held_out") or {}),
         _pictures(reconstruction, capture),
         _lights(reconstruction, capture),
         _rounds(metrics.get("rounds") or []),
@@ -75,9 +79,9 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{STYLE}{VIEWER_STYLE}</style></head>\n<body>\n"
+        f"<title>{title}</title><style>{STYLE}{VIEWER_STYLE}</style></head>\n<body>\n<main>\n"
         + "\n".join(filter(None, sections))
-        + "\n</body></html>\n"
+        + f"\n</main>\n<script>{ENLARGE}</script>\n</body></html>\n"
     )
 
 
@@ -167,9 +171,17 @@ SIGNS = {
 """Of the verdict (mvps.verdict): what, factor, unit."""
 
 
-def _signs(status: Mapping[str, Any]) -> str:
-    """By what the result was judged, without knowing the truth."""
+HELD_OUT = {
+    "held_out_views_psnr_db": "photographs of views that were held back, against the model: mean PSNR inside the mask",
+    "held_out_lights_psnr_db": "photographs under lights that were held back, against the model: mean PSNR inside the mask",
+}
+"""Of the held-out photographs (mvps.measures.images)."""
+
+
+def _signs(status: Mapping[str, Any], held_out: Mapping[str, Any]) -> str:
+    """By what the result was judged, without knowing the truth, and what photographs that were held back say of it."""
     rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if _is_number(status.get(key))]
+    rows += [(what, held_out[key], "dB") for key, what in HELD_OUT.items() if _is_number(held_out.get(key))]
     return _section("How good", _table(["sign", "value", ""], rows)) if rows else ""
 
 
@@ -190,8 +202,9 @@ def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
     shown = on_cores(lambda view: view_pictures(caster, senders, reconstruction, view), views)
     for view, (light, pictures) in zip(views, shown, strict=True):
         figures = "".join(
-            f'<figure><img src="{data_address(p.image)}" width="{p.image.shape[1]}" height="{p.image.shape[0]}"'
-            f' alt="{escape(p.text)}"><figcaption>{escape(p.title)}</figcaption></figure>'
+            '<figure><button type="button" class="enlarge" aria-expanded="false" title="larger or smaller">'
+            f'<img src="{data_address(p.image)}" width="{p.image.shape[1]}" height="{p.image.shape[0]}"'
+            f' alt="{escape(p.text)}"></button><figcaption>{escape(p.title)}</figcaption></figure>'
             for p in pictures
         )
         parts.append(f'<h3>{escape(view.name)}, {escape(light)}</h3><div class="grid">{figures}</div>')

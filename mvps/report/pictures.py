@@ -17,8 +17,8 @@ from mvps.rendering import light_arriving, photograph, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View, expected_error_deg
 from mvps.visibility import RayCaster
 
-LARGEST_SIDE = 360
-"""Pixels of a picture: sharp in one of two columns of a phone, and 32 of them stay far below the page's limit."""
+LARGEST_SIDE = 800
+"""Pixels of a picture: as wide as a page when it is enlarged, and 32 of them, 0.15 MB each, stay below the 15 MB that a page may have."""
 JPEG_QUALITY = 85
 ERROR_SPAN = 0.25
 """Error that is drawn brightest, as a share of the photograph's white."""
