@@ -72,6 +72,18 @@ def shown(page: Any) -> np.ndarray:
     return image[4:-4, 4:-4]
 
 
+PINCH = """() => {
+const canvas = document.getElementById("viewer"), box = canvas.getBoundingClientRect();
+canvas.setPointerCapture = () => {};
+const at = (kind, id, x) => canvas.dispatchEvent(new PointerEvent(kind, {
+    pointerId: id, pointerType: "touch", clientX: box.left + x, clientY: box.top + 100, bubbles: true }));
+at("pointerdown", 7, 100); at("pointerdown", 8, 200);
+for (const x of [220, 240, 260]) at("pointermove", 8, x);
+at("pointerup", 8, 260); at("pointerup", 7, 100);
+}"""
+"""Fingers 100 pixels apart, then 160."""
+
+
 def test_the_report_shows_the_model_without_a_server(
     scene: SphereScene, tmp_path: Path, opened: Callable[[str], tuple[Any, list[str]]]
 ) -> None:
@@ -100,6 +112,16 @@ def test_the_report_shows_the_model_without_a_server(
     assert np.abs(shown(page) - before).mean() < 0.1
     page.select_option("#viewer-layer", "normals")
     assert np.abs(shown(page) - lit).mean() > 5
+    page.select_option("#viewer-layer", "shadow")
+    grey = shown(page)
+    assert np.ptp(grey, axis=-1).max() < 2 and (grey > 250).mean() > 0.05 and (grey < 5).any(), "lit and not lit"
+    page.select_option("#viewer-layer", "depth")
+    near = shown(page)
+    assert np.ptp(near, axis=-1).max() < 2 and near.max() > 100 and near.std() > 10
+    page.select_option("#viewer-layer", "image")
+    before = (shown(page) > 60).mean()
+    page.evaluate(PINCH)
+    assert (shown(page) > 60).mean() > 1.3 * before, "two fingers that part bring the object nearer"
     picture = page.locator("main figure img").first
     small = picture.bounding_box()["width"]
     picture.click()

@@ -13,10 +13,11 @@ import pytest
 import trimesh
 
 from mvps.camera import project
-from mvps.scene import Camera, Capture, Truth
+from mvps.scene import Camera, Capture, Surface, Truth
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import WHITE, Scene, make_scene, photograph_scene
 from mvps.synthetic.settings import SceneSettings
+from mvps.visibility import RayCaster
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
@@ -218,6 +219,38 @@ def test_a_bowl_is_hollow_and_rods_are_thin() -> None:
     width = min(part.bounding_cylinder.primitive.radius for part in trimesh.Trimesh(surface.vertices, surface.faces).split())
     # Half a pixel, where a radius of the object is 0.45 of 160 pixels.
     assert width * 0.45 * 160 == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_sheet_is_open_and_seen_from_its_front() -> None:
+    surface = scenes.sheet(0.08)
+    body = trimesh.Trimesh(surface.vertices, surface.faces)
+    assert not body.is_watertight and body.body_count == 1 and len(body.outline().entities) > 0
+    made = scenes.shaped_as(surface, SMALL, scenes.ARC)
+    normal = body.face_normals.mean(0)
+    assert all(camera.rotation[2] @ normal < -0.3 * np.linalg.norm(normal) for camera in made.cameras)
+    flat = trimesh.Trimesh(scenes.sheet(0).vertices, surface.faces)
+    assert np.ptp(flat.vertices @ flat.face_normals[0]) < 1e-9
+
+
+def test_light_between_the_walls_of_a_box_is_that_of_an_oven() -> None:
+    """Inside a closed box whose walls shine alike, every point is sent what they shine: B = E + a B."""
+    box = trimesh.creation.box((1.0, 1.0, 1.0)).subdivide_to_size(0.1)
+    inside = Surface(np.asarray(box.vertices), np.asarray(box.faces)[:, ::-1])
+    G = scenes.sent_between(RayCaster(inside))
+    assert G.sum(1).min() > 0.99, "no ray leaves it"
+    open_above = Surface(inside.vertices, inside.faces[(inside.vertices[inside.faces][..., 2] < 0.499).any(1)])
+    floor = np.linalg.norm(open_above.vertices - (0, 0, -0.5), axis=1) < 1e-6
+    # From the middle of the floor to a quarter of the opening, 1/2 by 1/2 at a height of 1 (Howell's catalogue of view factors, B-4).
+    quarter = 2 * np.arctan(0.5 / np.sqrt(1.25)) * 0.5 / np.sqrt(1.25) / (2 * np.pi)
+    assert scenes.sent_between(RayCaster(open_above)).sum(1)[floor] == pytest.approx(1 - 4 * quarter, abs=0.1)
+
+
+def test_walls_stand_behind_masks(made: tuple[Capture, Truth]) -> None:
+    given = damage.before_bright(made[0], 2, np.random.default_rng(0))
+    for view, before in zip(given.views, made[0].views, strict=True):
+        added = ~before.mask[view.mask]
+        assert added.any() and (view.samples[added] == damage.background(before)).all()
+        assert np.array_equal(view.samples[~added], before.samples)
 
 
 def test_a_zoomed_object_leaves_the_image(scene: Scene) -> None:

@@ -21,11 +21,12 @@ from mvps.synthetic.settings import SceneSettings
 
 
 class Sample(NamedTuple):
-    """The capture that the program is given, the good one, and the good one's truth."""
+    """The capture that the program is given, the good one, and the good one's truth; bright: a wall stands behind the object."""
 
     given: Capture
     good: Capture
     truth: Truth
+    bright: bool = False
 
 
 class Case(NamedTuple):
@@ -47,15 +48,20 @@ def of_scene(settings: SceneSettings = BASE, change: Change | None = None, take:
     return Sample(good, good, truth)
 
 
-def of_shape(shape: Callable[[], Surface]) -> Sample:
+def of_shape(shape: Callable[[], Surface], take: Photograph | None = None, arc: float = 2 * np.pi) -> Sample:
     """Another object under the base's settings."""
-    return of_scene(change=lambda _: scenes.shaped_as(shape()))
+    return of_scene(change=lambda _: scenes.shaped_as(shape(), arc=arc), take=take)
 
 
 def damaged(by: Damage, amount: float) -> Sample:
     """The base damaged; chance starts anew for every case."""
     good, truth = base()
     return Sample(by(good, amount, np.random.default_rng(0)), good, truth)
+
+
+def bright(px: float) -> Sample:
+    """The base in front of a bright wall, with masks that reach this much too far."""
+    return damaged(damage.before_bright, px)._replace(bright=True)
 
 
 def _number(value: float) -> str:
@@ -113,6 +119,8 @@ def _masks() -> Iterator[tuple[str, Callable[[], Sample]]]:
     for px in (1, 3, 6):
         yield f"masks-grown-{px}-px", partial(damaged, damage.grown, px)
         yield f"masks-shrunk-{px}-px", partial(damaged, damage.shrunk, px)
+    for px in (0, 3):
+        yield f"masks-grown-{px}-px-bright", partial(bright, px)
     yield "masks-holes", partial(damaged, damage.holed, 3)
     yield "mask-blob", partial(damaged, damage.blobbed, 6)
     yield "mask-limb-missing", partial(damaged, damage.limb_missing, 0.2)
@@ -131,6 +139,9 @@ def _shapes() -> Iterator[tuple[str, Callable[[], Sample]]]:
         yield f"shape-rods-{_number(px)}-px", partial(of_shape, partial(scenes.rods, px))
     for name in ("bowl", "touching", "slab", "sphere"):
         yield f"shape-{name}", partial(of_shape, getattr(scenes, name))
+    yield "shape-bowl-lit-within", partial(of_shape, scenes.bowl, scenes.lit_between)
+    for name, height in (("plane", 0.0), ("open", 0.08)):
+        yield f"shape-{name}", partial(of_shape, partial(scenes.sheet, height), arc=scenes.ARC)
     yield "shape-cut-by-border", partial(of_scene, change=lambda scene: scenes.zoomed(scene, 1.4))
 
 
@@ -184,7 +195,7 @@ def by_chance(number: int) -> tuple[Sample, str]:
     rng = np.random.default_rng((number, 7))
     settings = SceneSettings(
         views=int(rng.integers(3, 11)),
-        lights=int(rng.integers(3, 13)),
+        lights=int(rng.integers(1, 13)),
         size=int(rng.integers(96, 129)),
         free_lights=bool(rng.random() < 0.2),
         strength=float(rng.uniform(0, 3)),

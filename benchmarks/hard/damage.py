@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
@@ -126,6 +127,24 @@ def grown(capture: Capture, px: float, rng: np.random.Generator) -> Capture:
 def shrunk(capture: Capture, px: float, rng: np.random.Generator) -> Capture:
     """Masks that reach this much too little."""
     return grown(capture, -px, rng)
+
+
+def background(view: View) -> NDArray[np.uint16]:
+    """(lights, 3) what a grey wall behind the object shows: as bright as the object under the same light, in the median."""
+    shown: NDArray[np.uint16] = np.median(view.samples, 0).astype(np.uint16)
+    return shown
+
+
+def before_bright(capture: Capture, px: float, rng: np.random.Generator) -> Capture:
+    """Masks that reach this much too far, where photographs show a wall (`background`)."""
+
+    def change(view: View) -> View:
+        wide = with_mask(view, distance_transform_edt(~view.mask) <= px)
+        samples = wide.samples.copy()
+        samples[~view.mask[wide.mask]] = background(view)
+        return replace(wide, samples=samples)
+
+    return each_view(capture, change)
 
 
 def disc(view: View, at: Float, radius: float) -> Bool:

@@ -5,26 +5,30 @@ radius 1, of which a radius is seen as 0.45 of the image's width at most.
 
 Near light   a point light at p = distance * direction from the object's centre, as strong there as the directional one it replaces:
              the light at x comes along (p - x) / |p - x| and is distance^2 / |p - x|^2 times as strong.
+Radiosity    B = a (E + G B) on the vertices: albedo a, direct light E, and G the mean over rays that leave a vertex with the cosine's
+             density of B where they first hit, nothing where they hit nothing (Goral et al. 1984). Bodies send light, highlights do not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import trimesh
 from numpy.typing import NDArray
 
 from mvps.camera import view_directions
 from mvps.mesh import normalise, vertex_normals
-from mvps.rendering import Arriving, points_under, shaded
+from mvps.rendering import Arriving, photograph, points_under, shaded
 from mvps.scene import Camera, Capture, Float, Int, Lights, Material, Surface, Truth
 from mvps.synthetic.scene import Photograph, Scene, make_cameras, make_lights, make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
 from mvps.synthetic.shape import make_material
-from mvps.visibility import RayCaster
+from mvps.visibility import RayCaster, camera_hits, cast_shadow, interpolate
 
 BASE = SceneSettings(views=8, lights=10, size=128)
 
@@ -94,6 +98,41 @@ def near(distance: float) -> Photograph:
     return take
 
 
+RAYS_BETWEEN, BOUNCES = 128, 6
+"""Of radiosity: rays of a vertex, and how often light is sent on (mean albedo 0.4: what is left is below 0.01)."""
+
+
+@lru_cache(maxsize=1)
+def sent_between(caster: RayCaster) -> sp.csr_matrix:
+    """G (V, V) of a mesh."""
+    normal, rng, n = caster.vertex_normals, np.random.default_rng(0), len(caster.vertex_normals)
+    # A point of the unit sphere around the tip of the normal lies in a direction of the cosine's density.
+    direction = normalise(np.repeat(normal, RAYS_BETWEEN, 0) + normalise(rng.normal(size=(n * RAYS_BETWEEN, 3))))
+    hits = caster.first_hits(np.repeat(caster.surface.vertices + caster.offset * normal, RAYS_BETWEEN, 0), direction)
+    rows, columns = np.repeat(np.arange(n), 3 * RAYS_BETWEEN), caster.surface.faces[np.maximum(hits.face, 0)].ravel()
+    return sp.csr_matrix((hits.barycentric.ravel() / RAYS_BETWEEN, (rows, columns)), (n, n))
+
+
+def lit_between(
+    caster: RayCaster,
+    material: Material,
+    camera: Camera,
+    pixels: Int,
+    direction: Float,
+    intensity: Float,
+    arriving: Arriving | None = None,
+) -> NDArray[np.float32]:
+    """Photographs of an object whose parts light each other."""
+    G, n = sent_between(caster), len(material.albedo)
+    direct = np.maximum(caster.vertex_normals @ direction.T, 0) * ~cast_shadow(caster, np.arange(n), direction)
+    albedo, arrives = material.albedo[:, None], np.zeros((n, len(direction), 3))
+    for _ in range(BOUNCES):
+        arrives = (G @ (albedo * (direct[..., None] + arrives)).reshape(n, -1)).reshape(arrives.shape)
+    more = interpolate(caster.surface, camera_hits(caster, camera, pixels), albedo * arrives)
+    image = photograph(caster, material, camera, pixels, direction, intensity)
+    return image + (more * intensity).astype(np.float32)
+
+
 # ------------------------------------------------------------------------------------------------ materials
 
 
@@ -111,12 +150,12 @@ def made_of(scene: Scene, albedo: float | None, weight: tuple[float, ...] | None
 # ------------------------------------------------------------------------------------------------ shapes
 
 
-def shaped_as(surface: Surface, settings: SceneSettings = BASE) -> Scene:
-    """The settings' scene with another object: its ball (radius 1 around the origin) gets the settings' extent."""
+def shaped_as(surface: Surface, settings: SceneSettings = BASE, arc: float = 2 * np.pi) -> Scene:
+    """The settings' scene with another object: its ball (radius 1 around the origin) gets the settings' extent. arc: of the cameras."""
     material_rng, light_rng = (np.random.default_rng((settings.seed, part)) for part in (1, 2))
     material = make_material(surface.vertices, vertex_normals(surface), settings.strength, material_rng)
     vertices = surface.vertices * settings.extent / 2
-    cameras = make_cameras(settings, vertices)
+    cameras = make_cameras(settings, vertices, arc)
     return Scene(Surface(vertices, surface.faces), material, cameras, make_lights(settings, cameras, light_rng))
 
 
@@ -136,6 +175,22 @@ def sphere() -> Surface:
 def slab() -> Surface:
     """A plate on its narrow side, a tenth as thick as wide."""
     return surface_of(trimesh.creation.box((1.6, 0.16, 1.2)))
+
+
+ARC = np.radians(120)
+"""Of the cameras in front of a sheet."""
+
+
+def sheet(height: float) -> Surface:
+    """A square of paper, open at its edges and without a back, in waves of this height; upright, facing the middle of ARC."""
+    ticks = np.linspace(-0.68, 0.68, 69)
+    y, z = np.meshgrid(ticks, ticks, indexing="ij")
+    x = height * np.sin(7 * y + 2 * np.sin(3 * z)) * np.cos(6 * z)
+    middle = ARC * (BASE.views - 1) / (2 * BASE.views)
+    points = np.stack([x * np.cos(middle) - y * np.sin(middle), x * np.sin(middle) + y * np.cos(middle), z], -1).reshape(-1, 3)
+    corner = (np.arange(68)[:, None] * 69 + np.arange(68)).ravel()
+    faces = np.concatenate([np.stack([corner, corner + 69, corner + 70], -1), np.stack([corner, corner + 70, corner + 1], -1)])
+    return Surface(points / np.linalg.norm(points, axis=-1).max(), faces)
 
 
 def bowl() -> Surface:

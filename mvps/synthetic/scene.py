@@ -34,15 +34,16 @@ class Scene:
     lights: Lights
 
 
-def make_cameras(settings: SceneSettings, vertices: Float) -> tuple[Camera, ...]:
-    """Cameras evenly around the z axis, in turn 15 and 40 degrees above the equator, ten extents away, looking at the origin.
+def make_cameras(settings: SceneSettings, vertices: Float, arc: float = 2 * np.pi) -> tuple[Camera, ...]:
+    """Cameras evenly around the z axis or along an arc of it (radians), in turn 15 and 40 degrees above the equator, ten extents away,
+    looking at the origin.
 
     All have the focal length at which the vertices (V, 3), seen from everywhere, just leave the outer 5 % of the images free.
     """
     distance = 10 * settings.extent
     poses = []
     for i in range(settings.views):
-        azimuth, elevation = 2 * np.pi * i / settings.views, np.radians((15, 40)[i % 2])
+        azimuth, elevation = arc * i / settings.views, np.radians((15, 40)[i % 2])
         backward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
         right = normalise(np.cross(-backward, (0.0, 0.0, 1.0)))
         poses.append(np.stack([right, np.cross(-backward, right), -backward]))

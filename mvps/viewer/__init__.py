@@ -104,7 +104,7 @@ def _controls(environments: Sequence[str]) -> str:
         )
     return (
         '<p class="viewer-controls"><label>Show <select id="viewer-layer">'
-        + _options(("image", "albedo", "highlights", "normals", "confidence"))
+        + _options(("image", "albedo", "highlights", "normals", "confidence", "depth", "shadow"))
         + '</select></label> <label>Drag <select id="viewer-drag"><option value="turn">turns the object</option>'
         '<option value="light">moves the light</option></select></label>'
         ' <label>Fill light <input id="viewer-fill" type="range" min="0" max="1" step="0.05" value="0.1"></label>'

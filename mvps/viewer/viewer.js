@@ -87,7 +87,7 @@
     precision highp float; precision highp int; precision highp sampler2DArrayShadow;
     in vec3 x, n, rho, surrounding; in vec4 w, seen; in float certain;
     uniform vec3 eye, light[${MOST}], lamp[${MOST}]; uniform int lights;
-    uniform float exposure, fill; uniform bool traced; uniform mat4 fromLight[${MOST}]; uniform sampler2DArrayShadow depths;
+    uniform float exposure, fill; uniform vec2 range; uniform bool traced; uniform mat4 fromLight[${MOST}]; uniform sampler2DArrayShadow depths;
     out vec4 colour;
     ${MODEL}
     float visibility(int k) {
@@ -106,6 +106,13 @@
       if (layer == 3) { colour = vec4((N + 1.0) / 2.0, 1.0); return; }
       if (layer == 4) { colour = vec4(vec3(certain), 1.0); return; }
       if (layer == 1) { colour = vec4(srgb(body * exposure), 1.0); return; }
+      if (layer == 5) { colour = vec4(vec3(1.0 - (length(eye - x) - range.x) / (range.y - range.x)), 1.0); return; }
+      if (layer == 6) {
+        float free = 0.0;
+        for (int k = 0; k < lights; k++) free += dot(N, light[k]) > 0.0 ? visibility(k) : 0.0;
+        colour = vec4(vec3(free / float(lights)), 1.0);
+        return;
+      }
       vec3 shown = surrounding + fill * lit(body, w, N, v, v);
       for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, N, v, light[k]) * visibility(k);
       colour = vec4(srgb(shown * exposure), 1.0);
@@ -224,6 +231,7 @@
     set(shown, "white", "1f", about.white);
     set(shown, "grazing", "1f", about.grazing);
     set(shown, "exposure", "1f", 2 ** Number(byId("viewer-exposure").value) / about.white / 1.5);
+    set(shown, "range", "2f", away - radius, away + radius);
     set(shown, "fill", "1f", Number(byId("viewer-fill").value));
     set(shown, "layer", "1i", byId("viewer-layer").selectedIndex);
     set(shown, "microfacet", "1i", about.microfacet ? 1 : 0);
@@ -307,24 +315,42 @@
     }
     later();
   };
+  const nearer = (factor) => {
+    leave();
+    distance = Math.min(Math.max(distance / factor, 1.2 * radius), 20 * radius);
+    later();
+  };
   let held = null;
+  // Fingers by their numbers; two of them pinch.
+  const fingers = new Map();
+  const between = () => { const [a, b] = fingers.values(); return Math.hypot(a[0] - b[0], a[1] - b[1]); };
   canvas.addEventListener("pointerdown", (e) => {
+    fingers.set(e.pointerId, [e.clientX, e.clientY]);
     held = [e.clientX, e.clientY, e.button === 2 || e.shiftKey || byId("viewer-drag").value === "light"];
     canvas.setPointerCapture(e.pointerId);
     canvas.focus();
   });
   canvas.addEventListener("pointermove", (e) => {
-    if (!held) return;
+    if (!held || !fingers.has(e.pointerId)) return;
+    const before = fingers.size === 2 ? between() : 0;
+    fingers.set(e.pointerId, [e.clientX, e.clientY]);
+    if (fingers.size > 1) {
+      if (before) nearer(between() / before);
+      return;
+    }
     move((e.clientX - held[0]) / 150, (e.clientY - held[1]) / 150, held[2]);
     held = [e.clientX, e.clientY, held[2]];
   });
-  canvas.addEventListener("pointerup", () => { held = null; });
+  ["pointerup", "pointercancel"].forEach((name) => canvas.addEventListener(name, (e) => {
+    fingers.delete(e.pointerId);
+    // The finger that stays goes on from where it is.
+    const [left] = fingers.values();
+    held = left ? [...left, held && held[2]] : null;
+  }));
   canvas.addEventListener("contextmenu", (e) => e.preventDefault());
   canvas.addEventListener("wheel", (e) => {
     e.preventDefault();
-    leave();
-    distance = Math.min(Math.max(distance * Math.exp(e.deltaY / 800), 1.2 * radius), 20 * radius);
-    later();
+    nearer(Math.exp(-e.deltaY / 800));
   }, { passive: false });
   canvas.addEventListener("keydown", (e) => {
     const step = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, -0.1], ArrowDown: [0, 0.1] }[e.key];
