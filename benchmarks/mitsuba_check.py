@@ -140,7 +140,8 @@ def row(folder: Path, capture: Path, pictures: Path | None) -> list[str]:
     photographed = [mean("ours", "photograph"), mean("mitsuba", "photograph")]
     of_lobes = f"{100 * lobes:.1f}" if result.material.specular_weight.any() else "-"
     rest = [of_lobes, f"{100 * whole:.1f}", f"{tangent_gap_deg(model).mean():.2f}"]
-    return [folder.name, str(len(model.faces)), str(len(found)), *against, *photographed, *rest]
+    count = f"{len(found)} {'held out' if result.settings.get('hold_out_lights') else 'used'}"
+    return [folder.name, str(len(model.faces)), count, *against, *photographed, *rest]
 
 
 def strip(pair: Pair) -> Any:

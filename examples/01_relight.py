@@ -4,44 +4,51 @@ python examples/01_relight.py RESULT CAPTURE picture.png
 """
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from mvps.export import read_reconstruction
+from mvps.illumination import Illumination
+from mvps.layers import rendered
 from mvps.load import read_capture
-from mvps.rendering import photograph, points_under
+from mvps.pbr import srgb_bytes, white_level
 from mvps.visibility import RayCaster
 
-
-def picture(view, values):
-    """Values (pixels, 3) of a view's foreground pixels as an image, white around the object."""
-    image = np.ones((*view.mask.shape, 3))
-    image[view.mask] = np.clip(values, 0, 1)
-    rows, columns = np.nonzero(view.mask)
-    return image[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+FINER = 3
+"""Pixels of the picture to one of the photograph's."""
 
 
 def main(result: str, capture: str, out: str) -> None:
     reconstruction = read_reconstruction(Path(result))
     view = read_capture(capture).views[0]
-    caster = RayCaster(reconstruction.surface)
-    points = points_under(caster, reconstruction.material, view.camera, view.pixels)
-
+    camera = replace(
+        view.camera,
+        K=np.diag([FINER, FINER, 1.0]) @ view.camera.K,
+        height=FINER * view.camera.height,
+        width=FINER * view.camera.width,
+    )
     # A light from the upper right, halfway to the camera. Camera axes: x right, y down, z forward.
-    light = np.array([[1.0, -1.0, -1.0]]) / np.sqrt(3) @ view.camera.rotation
-    relit = photograph(caster, reconstruction.material, view.camera, view.pixels, light, np.ones((1, 3)))[:, 0]
-    brightest = np.quantile(relit, 0.99)
+    direction = np.array([[1.0, -1.0, -1.0]]) / np.sqrt(3) @ camera.rotation
+    light = Illumination(direction, np.ones((1, 3)))
+    layers, coverage = rendered(RayCaster(reconstruction.surface), reconstruction.material, camera, light, ("image", "albedo", "normals"))
 
-    photo = view.radiance()[:, 0]
-    local = points.normal @ view.camera.rotation.T * (1, -1, -1)
-    albedo = points.albedo / np.quantile(points.albedo, 0.99)
-    layers = [photo / np.quantile(photo, 0.99), (local + 1) / 2, albedo, relit / brightest]
-    # Radiance and albedo are linear; screens want a gamma. Normals are directions and stay as they are.
-    shown = [picture(view, np.clip(layer, 0, 1) ** (1 if i == 1 else 1 / 2.2)) for i, layer in enumerate(layers)]
-    row = cv2.resize(np.concatenate(shown, 1), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-    cv2.imwrite(out, np.rint(255 * np.clip(row, 0, 1)).astype(np.uint8)[..., ::-1])
+    photo = np.full((*view.mask.shape, 3), white_level(view.radiance()[:, 0]), np.float32)
+    photo[view.mask] = view.radiance()[:, 0]
+    photo = cv2.resize(photo, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    # Radiance and albedo are linear; screens want a curve. Normals are directions and stay as they are.
+    on_object = coverage > 0
+    photo, albedo, relit = (srgb_bytes(x / white_level(x[on_object])) for x in (photo, layers["albedo"], layers["image"]))
+    local = layers["normals"] @ camera.rotation.T * (1, -1, -1)
+    normals = np.rint(127.5 * (local + 1)).astype(np.uint8)
+
+    rows, columns = np.nonzero(on_object)
+    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    paper = 255 * (1 - coverage[..., None])
+    shown = [np.rint(x * coverage[..., None] + paper)[box].astype(np.uint8) for x in (photo, normals, albedo, relit)]
+    cv2.imwrite(out, np.concatenate(shown, 1)[..., ::-1])
 
 
 if __name__ == "__main__":
