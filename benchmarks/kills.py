@@ -4,8 +4,8 @@
 
 Makes a small capture in a temporary folder and reconstructs it once undisturbed. Then it is reconstructed again and again, each time
 killed `each` times at moments drawn evenly from what is left of the undisturbed run's time, and resumed after every kill. All files of the
-result have to be the same, metrics.json but for times and memory (and report.html, which shows them). Prints a line a kill; exit code 1
-where something differs.
+result have to be the same, metrics.json but for times and memory (and report.html, which shows them). Prints a line a kill, and writes
+them to kills.md beside this file; exit code 1 where something differs.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ import tempfile
 import time
 from pathlib import Path
 from typing import Any
+
+from accuracy import HERE, machine
 
 TIMED = ("seconds", "peak_memory_mb")
 
@@ -72,6 +74,12 @@ def main() -> int:
         parser.add_argument(f"--{name}", type=int, default=default)
     given = parser.parse_args()
     random_, wrong, done, number = random.Random(given.seed), 0, 0, 0
+    said: list[str] = []
+
+    def say(text: str) -> None:
+        said.append(text)
+        print(text, flush=True)
+
     with tempfile.TemporaryDirectory() as folder:
         capture, whole = Path(folder) / "capture", Path(folder) / "whole"
         sizes = [f"--{name}={getattr(given, name)}" for name in ("views", "lights", "size")]
@@ -80,7 +88,7 @@ def main() -> int:
         start = time.perf_counter()
         subprocess.run([*command, "--out", str(whole)], check=True)
         seconds, wanted = time.perf_counter() - start, contents(whole)
-        print(f"undisturbed: {seconds:.1f} s, {len(wanted)} files", flush=True)
+        say(f"undisturbed: {seconds:.1f} s, {len(wanted)} files")
         while done < given.kills:
             number += 1
             out = Path(folder) / f"killed-{number}"
@@ -90,8 +98,11 @@ def main() -> int:
             differ = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name) or name not in found)
             wrong += bool(differ)
             outcome = f"differs in {', '.join(differ)}" if differ else "the same bytes"
-            print("\n".join(f"  {line}" for line in lines) + f"\nresult {number}: {outcome}", flush=True)
-        print(f"{done} kills, {number} results, {wrong} of them other than the undisturbed one")
+            say("\n".join(f"  {line}" for line in lines) + f"\nresult {number}: {outcome}")
+        say(f"{done} kills, {number} results, {wrong} of them other than the undisturbed one")
+    command_line = f"python benchmarks/kills.py --kills {given.kills} --each {given.each} --seed {given.seed}"
+    page = f"`{command_line}` on {machine('cpu')}: kill -9 at random moments, --resume after each.\n\n```\n" + "\n".join(said) + "\n```\n"
+    (HERE / "kills.md").write_text(page, encoding="utf-8")
     return int(wrong > 0)
 
 
