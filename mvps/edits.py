@@ -26,6 +26,7 @@ from scipy.cluster.vq import kmeans2
 
 from mvps.camera import project
 from mvps.load.images import read_mask, read_painting
+from mvps.mesh import edges
 from mvps.pbr import linear_of_srgb, reflectance_scale
 from mvps.scene import Bool, Camera, CaptureError, Float, Int, Material, Surface
 from mvps.silhouette import sampled
@@ -40,6 +41,9 @@ PRESETS: Mapping[str, tuple[float, tuple[float, float, float] | None, bool]] = {
 }
 """Sharpness; F0, None without highlights; whether it is a metal, without diffuse light. 0.04 is glass and plastics, of index 1.5; gold as
 in Hoffman's notes for the course on physically based shading, SIGGRAPH 2010."""
+
+VOTES = 3
+"""Votes of neighbours on a vertex's kind: noise of single vertices and of pairs goes, what is three edges wide stays."""
 
 KEYS = {"region", "albedo", "specular", "preset"}
 REGION_KEYS = ({"view", "mask"}, {"cluster", "of"})
@@ -101,7 +105,7 @@ def region_of(surface: Surface, material: Material, region: Any, cameras: Mappin
         kind, of = int(region["cluster"]), int(region["of"])
         if not 1 <= kind <= of:
             raise ValueError(f"cluster {kind} of {of}")
-        return np.asarray(clusters(material, of) == kind - 1)
+        return np.asarray(clusters(surface, material, of) == kind - 1)
     camera, mask = _camera(cameras, region["view"]), read_mask(Path(region["mask"]))
     if mask.shape != (camera.height, camera.width):
         raise CaptureError(f"{region['mask']}: wanted {camera.width} x {camera.height} pixels, given {mask.shape[1]} x {mask.shape[0]}")
@@ -119,8 +123,9 @@ def _camera(cameras: Mapping[str, Camera], name: Any) -> Camera:
     return cameras[name]
 
 
-def clusters(material: Material, count: int) -> Int:
-    """(V,) kind of material, 0 the least glossy of `count`: k-means of the lobes' shares in albedo and weights."""
+def clusters(surface: Surface, material: Material, count: int) -> Int:
+    """(V,) kind of material, 0 the least glossy of `count`: k-means of the lobes' shares in albedo and weights, then VOTES votes of every
+    vertex with its neighbours, which leave no specks."""
     if not 1 <= count <= 16:
         raise ValueError(f"1 to 16 clusters, not {count}")
     weight = material.specular_weight.mean(2) if material.specular_weight.ndim == 3 else material.specular_weight
@@ -134,6 +139,14 @@ def clusters(material: Material, count: int) -> Int:
     centres, kind = kmeans2(share, start, minit="matrix")
     rank = np.argsort(np.argsort(centres.sum(1)))
     of_vertices: Int = rank[kind]
+    one_way = edges(surface)
+    ends = np.concatenate([one_way, one_way[:, ::-1]])
+    for _ in range(VOTES):
+        counts = np.zeros((len(share), count))
+        # A vertex keeps its kind where its neighbours are divided.
+        counts[np.arange(len(share)), of_vertices] = 0.5
+        np.add.at(counts, (ends[:, 0], of_vertices[ends[:, 1]]), 1)
+        of_vertices = counts.argmax(1)
     return of_vertices
 
 

@@ -89,7 +89,12 @@ def test_a_painted_picture_covers_what_its_camera_sees(tmp_path: Path) -> None:
 def test_kinds_of_material_are_found_from_the_weights() -> None:
     shiny = SURFACE.vertices[:, 2] > 0
     material = replace(MATERIAL, albedo=np.ones_like(MATERIAL.albedo), specular_weight=np.where(shiny[:, None], [0.5, 0.5], [0.05, 0.0]))
-    assert ((clusters(material, 2) == 1) == shiny).all()
+    assert ((clusters(SURFACE, material, 2) == 1) == shiny).all()
+    # Single vertices that noise puts to the other kind follow their neighbours.
+    speck = np.abs(SURFACE.vertices[:, 2]) > 0.6 * np.abs(SURFACE.vertices[:, 2]).max()
+    speck &= np.arange(len(speck)) % 7 == 0
+    noisy = replace(material, specular_weight=np.where((shiny ^ speck)[:, None], [0.5, 0.5], [0.05, 0.0]))
+    assert speck.sum() > 3 and ((clusters(SURFACE, noisy, 2) == 1) == shiny).all()
     changed = edited(SURFACE, material, [{"region": {"cluster": 2, "of": 2}, "albedo": {"factor": 0.5}}], {})
     assert ((changed.albedo[:, 0] < 1) == shiny).all()
 
