@@ -31,6 +31,8 @@ HERE = Path(__file__).resolve().parent
 DOCS = HERE.parent / "docs"
 CAPTURES = ("bunny", "armadillo", "spot", "buddha")
 PUBLISHED = ("pj16", "lz20")
+CLEARLY = 0.05
+"""Relative difference between errors that is more than another seed makes of mesh normals, 4 % at most (benchmarks/invariance.md)."""
 PICTURED = ("ours", "lz20", "pj16", "stage1", "unisurf+n", "hull")
 
 Runs = Mapping[str, Run]
@@ -59,11 +61,11 @@ def error(run: Run, key: str, digits: int = 2) -> str:
 
 
 def against(runs: Mapping[str, Runs], better: str, worse: str, key: str) -> tuple[str, bool]:
-    """The error of two methods on every capture that has both, as text, and whether the first is lower on all of them."""
+    """The error of two methods on every capture that has both, as text, and whether the first is lower on all of them, by CLEARLY."""
     found = [(name, of.get(better), of.get(worse)) for name, of in runs.items()]
     pairs = [(name, a, b) for name, a, b in found if a and b and key in a.errors and key in b.errors]
     text = ", ".join(f"{name} {error(b, key)} against {error(a, key)}" for name, a, b in pairs)
-    return text, bool(pairs) and all(a.errors[key] < b.errors[key] for _, a, b in pairs)
+    return text, bool(pairs) and all(a.errors[key] < (1 - CLEARLY) * b.errors[key] for _, a, b in pairs)
 
 
 def along(sweep: Sequence[Mapping[str, Any]], values: Sequence[str], key: str) -> str:
