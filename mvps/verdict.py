@@ -6,6 +6,7 @@ views_deg     median over the vertices of the standard deviation of different vi
 expected_deg  mean of the vertices' expected errors: sqrt(pi / 2) times the stated standard deviation along a tangent (stated.py)
 depth_px      mean over the seen vertices of e L: what one view alone sees has its depth from normals, and with an error of e (expected,
               radians) all over the distance of L pixels from the nearest vertex that a second view sees, it is e L off; 0 where two see
+photographs   median over the seen vertices of how many photographs show them
 hidden_px     mean over the seen vertices of how deep hollows may be where the model explains nothing (hollows.py)
 
 Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
@@ -39,6 +40,10 @@ CONTRADICTION_DEG = BAD_DEG / np.sqrt(2)
 DEPTH_PIXELS = 1.0
 """Of depth_px and hidden_px: surfaces of made objects in three or four views were 0.8 to 1.5 of the first off, those with hollows that were
 not dug 0.8 to 3 of the second, and off by a pixel in the mean they are of no use as a measurement."""
+
+UNKNOWNS = 3
+"""Of a vertex of one colour: two of its normal, its albedo. With no more photographs than that smoothness decides, residuals vanish, and no
+figure that rests on them tells the error."""
 
 LEAST_FACING = 0.2
 """Cosine of the angle between normal and view from which a view tells where the surface is: across it a pixel is five times as long."""
@@ -124,6 +129,14 @@ def depth_px(capture: Capture, surface: Surface, material: Material, seen: Seque
     return float((error * away).sum() / pixel / (views > 0).sum())
 
 
+def photographs(capture: Capture, surface: Surface, seen: Sequence[Int]) -> float:
+    """`photographs` above, where views see the vertices `seen`."""
+    count = np.zeros(len(surface.vertices), np.int64)
+    for view, index in zip(capture.views, seen, strict=True):
+        count[index] += len(view.lights)
+    return float(np.median(count[count > 0])) if count.any() else 0.0
+
+
 def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.float32]], seen: Sequence[Int]) -> float:
     """Median standard deviation of the normals of views at vertices that several see, degrees; 0 where none is. pictures: the views'
     normals (height, width, 3), NaN outside the masks; seen: the vertices that each sees."""
@@ -171,6 +184,7 @@ def signs(
         "views_deg": views_deg(capture, surface, pictures, seen),
         "expected_deg": expected_deg(material),
         "depth_px": depth_px(capture, surface, material, seen),
+        "photographs": photographs(capture, surface, seen),
         "hidden_px": hidden_px(capture, surface, unexplained, noise),
     }
 
@@ -193,6 +207,11 @@ def verdict(found: Mapping[str, float], settled: tuple[str, str], findings: Sequ
         )
     if found["expected_deg"] > BAD_DEG:
         doubts.append(f"normals are expected to be {found['expected_deg']:.0f} deg off in the mean")
+    if found["photographs"] <= UNKNOWNS:
+        doubts.append(
+            f"half of what is seen is in no more than {found['photographs']:.0f} photographs, which leave nothing to check a normal"
+            f" and an albedo by ({UNKNOWNS} unknowns)"
+        )
     if found["depth_px"] > DEPTH_PIXELS:
         doubts.append(
             f"the depth of what one view alone sees is likely to be {found['depth_px']:.1f} px off in the mean over the"

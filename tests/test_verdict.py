@@ -13,10 +13,19 @@ from mvps.camera import pixel_footprint, view_directions
 from mvps.finding import Finding
 from mvps.mesh import vertex_normals
 from mvps.scene import RELIABLE, Capture, Surface
-from mvps.verdict import LEAST_FACING, depth_px, expected_deg, noise_share, outline_px, seen_by, signs, verdict, views_deg
+from mvps.verdict import LEAST_FACING, depth_px, expected_deg, noise_share, outline_px, photographs, seen_by, signs, verdict, views_deg
 
 SETTLED = ("converged", "settled.")
-GOOD = {"misfit": 0.02, "noise": 0.01, "outline_px": 0.2, "views_deg": 2.0, "expected_deg": 1.0, "depth_px": 0.1, "hidden_px": 0.1}
+GOOD = {
+    "misfit": 0.02,
+    "noise": 0.01,
+    "outline_px": 0.2,
+    "views_deg": 2.0,
+    "expected_deg": 1.0,
+    "depth_px": 0.1,
+    "hidden_px": 0.1,
+    "photographs": 40.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +100,14 @@ def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_di
     assert depth_px(one, surface, material, [first]) == 0
 
 
+def test_photographs_of_a_place_are_those_of_the_views_that_see_it(scene: SphereScene) -> None:
+    two = scene.capture.select({view.name: view.lights[: k + 1] for k, view in enumerate(scene.capture.views[:2])})
+    surface = scene.reconstruction.surface
+    # The first view has one photograph, the second two.
+    assert photographs(two, surface, [np.arange(10), np.arange(4)]) == 1 and photographs(two, surface, [np.arange(4), np.arange(10)]) == 2
+    assert photographs(two, surface, [np.arange(10), np.arange(6)]) == 3 and photographs(two, surface, [np.arange(0), np.arange(0)]) == 0
+
+
 def test_noise_is_no_misfit(scene: SphereScene) -> None:
     r = scene.reconstruction
     everywhere = np.full(len(r.surface.vertices), 0.01)
@@ -117,6 +134,7 @@ def test_what_could_not_be_mended_is_a_doubt() -> None:
         ({"views_deg": 8.0}, "doubtful", "8 deg apart"),
         ({"expected_deg": 12.0}, "doubtful", "12 deg off"),
         ({"depth_px": 3.0}, "doubtful", "likely to be 3.0 px off"),
+        ({"photographs": 3.0}, "doubtful", "no more than 3 photographs"),
         ({"hidden_px": 1.5}, "doubtful", "would put the surface 1.5 px off"),
         ({"views_deg": 8.0, "expected_deg": 12.0}, "doubtful", "same place are 8 deg"),
     ],

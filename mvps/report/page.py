@@ -164,6 +164,7 @@ SIGNS = {
     "expected_deg": ("normals: expected error, mean", 1.0, "deg"),
     "depth_px": ("depth of what one view alone sees: expected error, mean over the surface", 1.0, "px"),
     "views_deg": ("normals of different views at the same place: standard deviation", 1.0, "deg"),
+    "photographs": ("photographs that show a place: median over the surface", 1.0, ""),
     "outline_px": ("outlines against the masks: distance, mean", 1.0, "pixels"),
     "misfit": ("photographs against the model, without noise: share of the signal", 100.0, "%"),
     "noise": ("noise of the photographs: share of the signal", 100.0, "%"),
