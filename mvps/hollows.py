@@ -24,7 +24,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from mvps.cores import neighbours
-from mvps.mesh import vertex_normals
+from mvps.mesh import vertex_areas, vertex_normals
 from mvps.scene import Float, Int, SignedDistanceGrid, Surface
 from mvps.visibility import ray_caster
 
@@ -54,8 +54,9 @@ def clearance(surface: Surface, unexplained: Float) -> Float:
 
 
 def hidden(surface: Surface, unexplained: Float) -> float:
-    """Mean of L over the vertices that are seen, world units."""
-    return float(clearance(surface, unexplained).sum() / max(1, np.isfinite(unexplained).sum()))
+    """Mean of L over the surface that is seen, world units."""
+    area = np.where(np.isfinite(unexplained), vertex_areas(surface), 0)
+    return float((clearance(surface, unexplained) * area).sum() / max(area.sum(), np.finfo(float).tiny))
 
 
 def solid(surface: Surface, like: SignedDistanceGrid) -> SignedDistanceGrid:

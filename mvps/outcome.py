@@ -110,7 +110,7 @@ def told(
 
     with progress.stage("verdict") as stage:
         of_used = [picture for view, picture in zip(capture.views, pictures, strict=True) if view.name in {v.name for v in used.views}]
-        found = signs(used, refined.surface, refined.material, of_used, refined.rounds[-1]["residual"], refined.unexplained)
+        found = signs(used, refined.surface, refined.material, of_used, refined.unexplained)
         status, text = verdict(found, (refined.status, refined.text), findings)
         # Normals of one view may be right, and heights wrong all the same.
         status = "one view" if words and status == "converged" else status

@@ -1,13 +1,16 @@
 """Whether a reconstruction is to be trusted, from what can be seen without the truth.
 
-misfit        of the image model, as a share of the images' signal, without the share that is noise
+Means and medians are over the surface that is seen, every vertex counting by its area: meshes are finer where a surface is creased, and
+over vertices a few creases would decide.
+
+misfit        median of what the image model leaves, as a share of a vertex's signal, without the share that is noise
 outline_px    area between the mesh's silhouettes and the masks over the masks' outlines: by how far outlines are off, in the mean
-views_deg     median over the vertices of the standard deviation of different views' normals at the same vertex
-expected_deg  mean of the vertices' expected errors: sqrt(pi / 2) times the stated standard deviation along a tangent (stated.py)
-depth_px      mean over the seen vertices of e L: what one view alone sees has its depth from normals, and with an error of e (expected,
+views_deg     median of the standard deviation of different views' normals at the same vertex
+expected_deg  mean of the normals' expected errors: sqrt(pi / 2) times the stated standard deviation along a tangent (stated.py)
+depth_px      mean of e L: what one view alone sees has its depth from normals, and with an error of e (expected,
               radians) all over the distance of L pixels from the nearest vertex that a second view sees, it is e L off; 0 where two see
-photographs   median over the seen vertices of how many photographs show them
-hidden_px     mean over the seen vertices of how deep hollows may be where the model explains nothing (hollows.py)
+photographs   median of how many photographs show a vertex
+hidden_px     mean of how deep hollows may be where the model explains nothing (hollows.py)
 
 Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
 sigma = median |I(x - 1) - 2 I(x) + I(x + 1)| / (0.6745 sqrt(6)); vertices interpolate between four pixels, which leaves two thirds of it.
@@ -26,7 +29,7 @@ from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.hollows import beyond_noise, hidden
 from mvps.material import POOR_FIT
-from mvps.mesh import lengths, normalise, vertex_normals
+from mvps.mesh import lengths, normalise, vertex_areas, vertex_normals
 from mvps.scene import Capture, Float, Int, Material, Surface, View, expected_error_deg
 from mvps.silhouette import mask_distances, sampled
 from mvps.visibility import RayCaster, camera_hits, ray_caster, visible_vertices
@@ -82,10 +85,15 @@ def noise_share(capture: Capture) -> float:
     return float(np.median(found)) if found else 0.0
 
 
-def expected_deg(material: Material) -> float:
-    """Mean expected error of the seen vertices' normals, degrees, none over 90; 90 where none is seen."""
-    seen = material.confidence[material.confidence > 0]
-    return float(np.minimum(expected_error_deg(seen), 90).mean()) if len(seen) else 90.0
+def median(values: Float, area: Float) -> float:
+    """The value (n,) that half of the area (n,) is not above; 0 of none."""
+    return float(np.quantile(values, 0.5, weights=area, method="inverted_cdf")) if len(values) and area.any() else 0.0
+
+
+def expected_deg(material: Material, area: Float) -> float:
+    """Mean expected error of normals where vertices of this area (V,) are seen, degrees, none over 90; 90 where none is seen."""
+    seen = (material.confidence > 0) & (area > 0)
+    return float(np.average(np.minimum(expected_error_deg(material.confidence[seen]), 90), weights=area[seen])) if seen.any() else 90.0
 
 
 def _silhouette(caster: RayCaster, view: View, distance: NDArray[np.float32]) -> tuple[float, float]:
@@ -126,7 +134,8 @@ def depth_px(capture: Capture, surface: Surface, material: Material, seen: Seque
     away = neighbours(cKDTree(several), alone)[0] if len(several) else np.full(len(alone), radius)
     # Confidence 0 knows nothing: the error's limit.
     error = np.radians(np.minimum(expected_error_deg(np.maximum(material.confidence[views == 1], 1e-12)), 90))
-    return float((error * away).sum() / pixel / (views > 0).sum())
+    area = vertex_areas(surface)
+    return float((error * away * area[views == 1]).sum() / pixel / max(area[views > 0].sum(), np.finfo(float).tiny))
 
 
 def photographs(capture: Capture, surface: Surface, seen: Sequence[Int]) -> float:
@@ -134,11 +143,11 @@ def photographs(capture: Capture, surface: Surface, seen: Sequence[Int]) -> floa
     count = np.zeros(len(surface.vertices), np.int64)
     for view, index in zip(capture.views, seen, strict=True):
         count[index] += len(view.lights)
-    return float(np.median(count[count > 0])) if count.any() else 0.0
+    return median(count[count > 0].astype(float), vertex_areas(surface)[count > 0])
 
 
 def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.float32]], seen: Sequence[Int]) -> float:
-    """Median standard deviation of the normals of views at vertices that several see, degrees; 0 where none is. pictures: the views'
+    """Median standard deviation of the normals of views where several see the surface, degrees; 0 where none do. pictures: the views'
     normals (height, width, 3), NaN outside the masks; seen: the vertices that each sees."""
 
     def of_view(view: View, picture: NDArray[np.float32], index: Int) -> tuple[Int, Float]:
@@ -155,7 +164,7 @@ def views_deg(capture: Capture, surface: Surface, pictures: Sequence[NDArray[np.
     # Of unit vectors: the mean square distance to their mean, over one view less than there are.
     n = count[several]
     variance = (1 - (total[several] ** 2).sum(1) / n**2) * n / (n - 1)
-    return float(np.degrees(np.sqrt(max(float(np.median(variance)), 0.0)))) if several.any() else 0.0
+    return float(np.degrees(np.sqrt(max(median(variance, vertex_areas(surface)[several]), 0.0))))
 
 
 def hidden_px(capture: Capture, surface: Surface, unexplained: Float, noise: float) -> float:
@@ -171,18 +180,17 @@ def signs(
     surface: Surface,
     material: Material,
     pictures: Sequence[NDArray[np.float32]],
-    residual: float,
     unexplained: Float,
 ) -> dict[str, float]:
-    """The figures above. residual: of the last round, as a share of the images' signal; unexplained (V,): of every vertex, NaN where no
-    view sees it."""
-    noise, seen = INTERPOLATED * noise_share(capture), seen_by(capture, surface)
+    """The figures above. unexplained (V,): what the model leaves, as a share of every vertex's signal, NaN where no view sees it."""
+    noise, seen, area = INTERPOLATED * noise_share(capture), seen_by(capture, surface), vertex_areas(surface)
+    known = np.isfinite(unexplained)
     return {
-        "misfit": float(beyond_noise(np.array(residual), noise)),
+        "misfit": median(beyond_noise(unexplained[known], noise), area[known]),
         "noise": noise,
         "outline_px": outline_px(capture, surface),
         "views_deg": views_deg(capture, surface, pictures, seen),
-        "expected_deg": expected_deg(material),
+        "expected_deg": expected_deg(material, area),
         "depth_px": depth_px(capture, surface, material, seen),
         "photographs": photographs(capture, surface, seen),
         "hidden_px": hidden_px(capture, surface, unexplained, noise),
@@ -227,4 +235,5 @@ def verdict(found: Mapping[str, float], settled: tuple[str, str], findings: Sequ
             f"There is reason to doubt this shape: {'; '.join(doubts)}. Look at masks and poses first, then whether there are enough views"
             " and lights."
         )
-    return settled
+    status, text = settled
+    return status, f"The model leaves {100 * found['misfit']:.1f} % of the images' signal unexplained. {text}"

@@ -11,9 +11,21 @@ from sphere_scene import SphereScene, make_sphere
 
 from mvps.camera import pixel_footprint, view_directions
 from mvps.finding import Finding
-from mvps.mesh import vertex_normals
+from mvps.mesh import vertex_areas, vertex_normals
 from mvps.scene import RELIABLE, Capture, Surface
-from mvps.verdict import LEAST_FACING, depth_px, expected_deg, noise_share, outline_px, photographs, seen_by, signs, verdict, views_deg
+from mvps.verdict import (
+    LEAST_FACING,
+    depth_px,
+    expected_deg,
+    median,
+    noise_share,
+    outline_px,
+    photographs,
+    seen_by,
+    signs,
+    verdict,
+    views_deg,
+)
 
 SETTLED = ("converged", "settled.")
 GOOD = {
@@ -69,10 +81,10 @@ def test_views_that_contradict_each_other(scene: SphereScene) -> None:
 
 def test_expected_error_is_the_stated_one(scene: SphereScene) -> None:
     material = scene.reconstruction.material
-    sigma = np.radians(4.0)
+    sigma, area = np.radians(4.0), vertex_areas(scene.reconstruction.surface)
     stated = replace(material, confidence=np.full(len(material.albedo), 1 / (1 + (sigma / RELIABLE) ** 2)))
-    assert expected_deg(stated) == pytest.approx(4.0 * np.sqrt(np.pi / 2), rel=1e-6)
-    assert expected_deg(replace(material, confidence=np.zeros(len(material.albedo)))) == 90
+    assert expected_deg(stated, area) == pytest.approx(4.0 * np.sqrt(np.pi / 2), rel=1e-6)
+    assert expected_deg(replace(material, confidence=np.zeros(len(area))), area) == 90
 
 
 def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_distance(scene: SphereScene) -> None:
@@ -88,10 +100,11 @@ def test_depth_of_what_one_view_sees_is_as_uncertain_as_its_normals_times_the_di
     both = np.intersect1d(first, second)[:10]
     pixel = pixel_footprint([view.camera for view in two.views], surface.vertices.mean(0))
     away = np.linalg.norm(surface.vertices[first][:, None] - surface.vertices[both], axis=2).min(1) / pixel
-    assert depth_px(two, surface, material, [first, both]) == pytest.approx(np.sqrt(np.pi / 2) * sigma * away.mean(), rel=1e-6)
+    mean = np.average(away, weights=vertex_areas(surface)[first])
+    assert depth_px(two, surface, material, [first, both]) == pytest.approx(np.sqrt(np.pi / 2) * sigma * mean, rel=1e-6)
     assert depth_px(two, surface, material, [both, both]) == 0
     unknown = replace(material, confidence=np.zeros(count))
-    assert depth_px(two, surface, unknown, [first, both]) == pytest.approx(np.pi / 2 * away.mean(), rel=1e-6)
+    assert depth_px(two, surface, unknown, [first, both]) == pytest.approx(np.pi / 2 * mean, rel=1e-6)
     # What a view sees from the side is not seen twice, and then nothing is: all is as far off as the object is large.
     aside = np.setdiff1d(first, second)[:10]
     radius = np.linalg.norm(surface.vertices - surface.vertices.mean(0), axis=1).mean() / pixel
@@ -111,13 +124,19 @@ def test_photographs_of_a_place_are_those_of_the_views_that_see_it(scene: Sphere
 def test_noise_is_no_misfit(scene: SphereScene) -> None:
     r = scene.reconstruction
     everywhere = np.full(len(r.surface.vertices), 0.01)
-    found = signs(scene.capture, r.surface, r.material, r.normal_maps, 0.2, everywhere)
+    found = signs(scene.capture, r.surface, r.material, r.normal_maps, everywhere)
     assert found["hidden_px"] == 0
     # A hemisphere that nothing explains hides what it spans.
     half = np.where(r.surface.vertices[:, 2] > 0, 1.0, everywhere)
     radius = np.linalg.norm(r.surface.vertices, axis=1).mean() / pixel_footprint([v.camera for v in scene.capture.views], np.zeros(3))
-    assert 0.15 < signs(scene.capture, r.surface, r.material, r.normal_maps, 0.2, half)["hidden_px"] / radius < 0.45
-    assert found["misfit"] == pytest.approx(np.sqrt(0.04 - found["noise"] ** 2)) and set(found) == set(GOOD)
+    assert 0.15 < signs(scene.capture, r.surface, r.material, r.normal_maps, half)["hidden_px"] / radius < 0.45
+    left = signs(scene.capture, r.surface, r.material, r.normal_maps, 20 * everywhere)
+    assert left["misfit"] == pytest.approx(np.sqrt(0.04 - found["noise"] ** 2)) and set(found) == set(GOOD)
+
+
+def test_a_fine_mesh_counts_no_more_than_a_coarse_one() -> None:
+    assert median(np.array([1.0, 1.0, 1.0, 5.0]), np.array([0.1, 0.1, 0.1, 1.0])) == 5
+    assert median(np.array([3.0, 1.0, 2.0]), np.ones(3)) == 2 and median(np.zeros(0), np.zeros(0)) == 0
 
 
 def test_what_could_not_be_mended_is_a_doubt() -> None:

@@ -291,7 +291,6 @@ def _settled(account: list[dict[str, float]]) -> tuple[str, str]:
             f" error), lights by {last['light_step_deg']:.2f} deg (settled below {enough_light:.2f}); a finer preset does more rounds."
         )
     return "converged", (
-        f"Residual {100 * last['residual']:.1f} % of the images' signal; in the last step normals turned by"
-        f" {last['last_step_deg']:.2f} deg, lights by {last['light_step_deg']:.2f} deg,"
+        f"In the last step normals turned by {last['last_step_deg']:.2f} deg, lights by {last['light_step_deg']:.2f} deg,"
         f" vertices by {last['vertex_change_px']:.2f} px."
     )
