@@ -236,4 +236,4 @@ def verdict(found: Mapping[str, float], settled: tuple[str, str], findings: Sequ
             " and lights."
         )
     status, text = settled
-    return status, f"The model leaves {100 * found['misfit']:.1f} % of the images' signal unexplained. {text}"
+    return status, f"Beside noise, the model leaves {100 * found['misfit']:.1f} % of the images' signal unexplained. {text}"

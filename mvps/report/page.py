@@ -34,10 +34,10 @@ STYLE = """
 body{font:16px/1.5 system-ui,sans-serif;color:var(--ink);background:var(--paper);margin:0 auto;max-width:72rem;padding:1rem}
 h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
 .status{padding:.7em 1em;background:var(--soft);border-left:4px solid var(--mark)}
-.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(8rem,1fr));gap:.6rem}
+.grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(max(8rem,22%),1fr));gap:.6rem}
 .grid .large{grid-column:1/-1}
 .enlarge{display:block;width:100%;padding:0;border:0;background:none;cursor:zoom-in}.large .enlarge{cursor:zoom-out}
-figure{margin:0}figure img{width:100%;height:auto;display:block}figcaption{font-size:.85rem}
+figure{margin:0}figure img{width:100%;height:auto;display:block}.grid .large img{height:90vh;object-fit:contain}figcaption{font-size:.85rem}
 .spheres{grid-template-columns:repeat(auto-fill,minmax(12rem,1fr))}.sphere{max-width:20rem}
 .wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
 th,td{text-align:left;padding:.25em .8em .25em 0;border-bottom:1px solid var(--line);vertical-align:top}
@@ -165,7 +165,7 @@ SIGNS = {
     "depth_px": ("depth of what one view alone sees: expected error, mean over the surface", 1.0, "px"),
     "views_deg": ("normals of different views at the same place: standard deviation", 1.0, "deg"),
     "photographs": ("photographs that show a place: median over the surface", 1.0, ""),
-    "outline_px": ("outlines against the masks: distance, mean", 1.0, "pixels"),
+    "outline_px": ("outlines against the masks: distance, mean", 1.0, "px"),
     "misfit": ("photographs against the model, without noise: share of the signal", 100.0, "%"),
     "noise": ("noise of the photographs: share of the signal", 100.0, "%"),
 }
