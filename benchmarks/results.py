@@ -103,16 +103,21 @@ def claims(runs: Mapping[str, Runs], sweeps: Mapping[str, Any]) -> list[list[str
     return lines
 
 
+def won(best: Run) -> str:
+    """Words for a published method that is the best."""
+    return f"**a baseline wins, {best.method}:** " if best.method in PUBLISHED else ""
+
+
 def verdict(runs: Runs) -> str:
     """Which method has the lowest errors and the highest F-score, and where a published one is faster than ours of the same accuracy."""
     lines = []
     score = "f_score_0_5_mm"
     highest = sorted((run for run in runs.values() if score in run.errors), key=lambda run: -run.errors[score])[:3]
     if highest:
-        lines.append(f"highest {score}: " + ", ".join(f"{run.method} {run.errors[score]:.3f}" for run in highest))
+        lines.append(f"{won(highest[0])}highest {score}: " + ", ".join(f"{run.method} {run.errors[score]:.3f}" for run in highest))
     for key in MEASURES:
         best = sorted((run for run in runs.values() if key in run.errors), key=lambda run: run.errors[key])[:3]
-        lines.append(f"lowest {key}: " + ", ".join(f"{run.method} {run.errors[key]:.3f}" for run in best))
+        lines.append(f"{won(best[0]) if best else ''}lowest {key}: " + ", ".join(f"{run.method} {run.errors[key]:.3f}" for run in best))
         for name, is_dominated in dominated(points_of([r for r in runs.values() if r.method in (*BUDGETS, *PUBLISHED)], key)).items():
             if not is_dominated:
                 lines.append(f"{name} is faster than all of ours that are as accurate ({key})")
