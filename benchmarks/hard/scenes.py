@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from mvps.camera import view_directions
 from mvps.mesh import normalise, vertex_normals
-from mvps.rendering import Arriving, photograph, points_under, shaded
+from mvps.rendering import photograph, points_under, shaded
 from mvps.scene import Camera, Capture, Float, Int, Lights, Material, Surface, Truth
 from mvps.synthetic.scene import Photograph, Scene, make_cameras, make_lights, make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -82,7 +82,6 @@ def near(distance: float) -> Photograph:
         pixels: Int,
         direction: Float,
         intensity: Float,
-        arriving: Arriving | None = None,
     ) -> NDArray[np.float32]:
         points = points_under(caster, material, camera, pixels)
         view = view_directions(camera, points.position)
@@ -120,7 +119,6 @@ def lit_between(
     pixels: Int,
     direction: Float,
     intensity: Float,
-    arriving: Arriving | None = None,
 ) -> NDArray[np.float32]:
     """Photographs of an object whose parts light each other."""
     G, n = sent_between(caster), len(material.albedo)

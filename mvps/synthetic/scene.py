@@ -21,7 +21,7 @@ WHITE = 2**16 - 1
 """Largest code value of the 16-bit images; radiance 1."""
 
 Photograph = Callable[..., NDArray[np.float32]]
-"""Takes photographs, with the arguments of `mvps.rendering.photograph`."""
+"""Takes photographs, with the first six arguments of `mvps.rendering.photograph`."""
 
 
 @dataclass(frozen=True, eq=False)
