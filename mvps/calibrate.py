@@ -10,7 +10,8 @@ sum_p rho(|A b'_p / |A b'_p| - n_p|). rho redescends and its scale shrinks (grad
 a hull's normals are exact near the silhouettes and far off in concavities.
 
 Where the lights stand still in the camera's frame (one rig), all pixels of all views are factorised together in camera frames.
-That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations.
+That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations. Of a view that
+shows three flat sides three factors explain anything, and its normals fix no A: from most views so, one rig is believed.
 
 Metals have no diffuse body, and the factors say nothing: where highlights explain the images better than Lambert's law does, the lights
 are those by correlation (correlation.py).
@@ -29,7 +30,7 @@ from numpy.typing import NDArray
 
 from mvps.cores import on_cores
 from mvps.correlation import glossy_lights, is_glossy
-from mvps.mesh import normalise, vertex_normals
+from mvps.mesh import lengths, normalise, vertex_normals
 from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
@@ -114,23 +115,34 @@ def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.
     return _Sampled(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)))
 
 
-def _null_vector(pseudo: Float, normal: Float, weight: Float) -> Float:
-    """(3, 3) A that minimises sum_p weight_p |n_p x (A b_p)|^2: the algebraic start."""
+def _gram(pseudo: Float, normal: Float, weight: Float) -> Float:
+    """(9, 9) of the quadratic form sum_p weight_p |n_p x (A b_p)|^2 in A."""
     # n x (A b) = 0 has the rows [n]_x (x) b^T; their Gram matrix is sum_p (1 - n n^T) (x) b b^T.
     project_out = np.eye(3) - normal[:, :, None] * normal[:, None, :]
     outer = pseudo[:, :, None] * pseudo[:, None, :]
-    gram = np.einsum("p,pij,pkl->ikjl", weight, project_out, outer, optimize=True).reshape(9, 9)
-    A: Float = np.linalg.eigh(gram)[1][:, 0].reshape(3, 3)
+    gram: Float = np.einsum("p,pij,pkl->ikjl", weight, project_out, outer, optimize=True).reshape(9, 9)
+    return gram
+
+
+def _null_vector(pseudo: Float, normal: Float, weight: Float) -> Float:
+    """(3, 3) A that minimises sum_p weight_p |n_p x (A b_p)|^2: the algebraic start."""
+    A: Float = np.linalg.eigh(_gram(pseudo, normal, weight))[1][:, 0].reshape(3, 3)
     return A * (1.0 if ((pseudo @ A.T * normal).sum(1) * weight).sum() > 0 else -1.0)
 
 
+def _inliers(residual: Float, weight: Float, scale: float) -> Float:
+    """(n,) weights of residuals (n, 3) by rho of Geman and McClure 1985 at `scale` radians."""
+    robust: Float = weight / (1 + (residual**2).sum(1) / scale**2) ** 2
+    return robust
+
+
 def _angle_step(A: Float, pseudo: Float, normal: Float, weight: Float, scale: float) -> Float:
-    """One Gauss-Newton step on sum_p weight_p rho(|A b_p / |A b_p| - n_p|), rho of Geman and McClure 1985 at `scale` radians."""
+    """One Gauss-Newton step on sum_p weight_p rho(|A b_p / |A b_p| - n_p|) at `scale` radians."""
     mapped = pseudo @ A.T
     length = np.maximum(np.linalg.norm(mapped, axis=1, keepdims=True), 1e-12)
     unit = mapped / length
     residual = unit - normal
-    robust = weight / (1 + (residual**2).sum(1) / scale**2) ** 2
+    robust = _inliers(residual, weight, scale)
     # d unit = (1 - unit unit^T) / length dA b
     project_out = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / length[:, :, None]
     jacobian = (project_out[:, :, :, None] * pseudo[:, None, None, :]).reshape(-1, 3, 9)
@@ -158,19 +170,55 @@ def solve_ambiguity(pseudo: Float, normal: Float, weight: Float) -> Float:
     return unimodular
 
 
+def _fixed(A: Float, pseudo: Float, normal: Float, weight: Float) -> bool:
+    """Whether normals (n, 3) fix A: whether no matrix at right angles to it puts most pixels within FINE_NORMAL of them too."""
+    unit = normalise(pseudo @ A.T)
+    inliers = _inliers(unit - normal, weight, FINE_NORMAL)
+    return bool(np.linalg.eigvalsh(_gram(unit, normal, inliers))[1] > FINE_NORMAL**2 * inliers.sum())
+
+
+def _ambiguity(factors: Factorisation, samples: list[_Sampled]) -> Float | None:
+    """(3, 3) A by the normals of the rough shape, None where they do not fix it."""
+    normal, weight = np.concatenate([s.normal for s in samples]), factors.weight.mean(1).astype(np.float64)
+    try:
+        A = solve_ambiguity(factors.left, normal, weight)
+    except np.linalg.LinAlgError:
+        return None
+    return A if _fixed(A, factors.left, normal, weight) else None
+
+
+def _mostly_fixed(separate: list[Factorisation], samples: list[_Sampled]) -> bool:
+    """Whether most views' own normals fix A."""
+    return 2 * sum(A is not None for A in on_cores(lambda f, s: _ambiguity(f, [s]), separate, samples)) > len(samples)
+
+
 def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
     """(lights, 3) intensity times direction in the frame of the samples' normals."""
-    normal = np.concatenate([s.normal for s in samples])
-    try:
-        A = solve_ambiguity(factors.left, normal, factors.weight.mean(1).astype(np.float64))
-    except np.linalg.LinAlgError as error:
-        raise CaptureError(
-            f"lights: wanted a rough shape whose normals point many ways, given one where {error}; use more views or --calibrated-lights"
-        ) from error
+    A = _ambiguity(factors, samples)
+    albedo, lights = _under_normals(samples) if A is None else (lengths(factors.left @ A.T), factors.right @ np.linalg.inv(A))
     # The median albedo is the unit, so that lights of separately solved views share one scale.
-    albedo = np.linalg.norm(factors.left @ A.T, axis=1) * np.concatenate([s.bright for s in samples])
-    scaled: Float = factors.right @ np.linalg.inv(A) * np.median(albedo)
+    scaled: Float = lights * np.median(albedo * np.concatenate([s.bright for s in samples]))
     return _without_gaps(scaled)
+
+
+def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
+    """Albedo (n,) over the pixels' bright levels and lights (lights, 3) in turn, for the rough shape's normals as they are."""
+    image, known, normal = (np.concatenate([getattr(s, name) for s in samples]) for name in ("image", "known", "normal"))
+    noise = float(np.median([s.noise for s in samples]))
+    if np.linalg.eigvalsh(normal.T @ normal)[0] < FINE_NORMAL**2 * len(normal):
+        raise CaptureError(
+            "lights: wanted a rough shape whose normals point many ways, given one where they all lie in one plane; use more views or"
+            " --calibrated-lights"
+        )
+    lights, albedo = solve_rows(image.T, known.T.astype(np.float64), normal), np.ones(len(image))
+    for _ in range(AMBIGUITY_SWEEPS):
+        shading = np.maximum(normal @ lights.T, 0)
+        lit = known & (shading > 0)
+        weight = robust_weights(image - albedo[:, None] * shading, lit, noise)
+        albedo = (weight * image * shading).sum(1) / np.maximum((weight * shading**2).sum(1), np.finfo(float).tiny)
+        weight = robust_weights((image - albedo[:, None] * shading).T, lit.T, noise)
+        lights = solve_rows(image.T, weight, albedo[:, None] * normal)
+    return albedo, lights
 
 
 def _without_gaps(scaled: Float) -> Float:
@@ -240,7 +288,8 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
             3,
             floor=float(np.median([s.noise for s in samples])),
         )
-        if together.residual**2 < POOLED_VARIANCE_RATIO * residual**2:
+        alike = together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
+        if alike or not _mostly_fixed(separate, samples):
             image, seen = (np.concatenate(parts) for parts in zip(*((s.absolute, s.normal) for s in samples), strict=True))
             metallic = is_glossy([image], [seen], generator)
             rig = glossy_lights(image, seen) if metallic else _scaled_lights(together, samples)
