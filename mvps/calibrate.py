@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from mvps.cores import on_cores
 from mvps.correlation import glossy_lights, is_glossy
-from mvps.mesh import lengths, normalise, vertex_normals
+from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
@@ -195,7 +195,9 @@ def _mostly_fixed(separate: list[Factorisation], samples: list[_Sampled]) -> boo
 def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
     """(lights, 3) intensity times direction in the frame of the samples' normals."""
     A = _ambiguity(factors, samples)
-    albedo, lights = _under_normals(samples) if A is None else (lengths(factors.left @ A.T), factors.right @ np.linalg.inv(A))
+    albedo, lights = (
+        _under_normals(samples) if A is None else (np.linalg.norm(factors.left @ A.T, axis=1), factors.right @ np.linalg.inv(A))
+    )
     # The median albedo is the unit, so that lights of separately solved views share one scale.
     scaled: Float = lights * np.median(albedo * np.concatenate([s.bright for s in samples]))
     return _without_gaps(scaled)

@@ -7,15 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps import calibrate
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
 from mvps.hull import bounds, default_cells, signed_distance, visual_hull
-from mvps.mesh import normalise
+from mvps.mesh import normalise, vertex_normals
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
 from mvps.silhouette import mask_distance
+from mvps.synthetic.scene import Scene, make_cameras, make_lights, render_capture
+from mvps.synthetic.settings import SceneSettings
+from mvps.synthetic.shape import make_material
 
 CPU = torch.device("cpu")
 
@@ -134,6 +138,37 @@ def test_few_lights_on_one_albedo_are_solved_from_the_rough_normals(scene: Spher
     few = capture.select({view.name: (1, 2) for view in capture.views})
     found = uncalibrated_lights(few, surface, 0).lights
     assert np.mean([degrees(a, b[:2]).mean() for a, b in zip(found.direction, truth.direction, strict=True)]) < 2
+
+
+def box() -> tuple[Capture, Lights]:
+    """Three flat, glossy sides in every view, under one rig."""
+    settings = SceneSettings(views=8, lights=10, size=64, seed=2)
+    made = trimesh.creation.box((1.0, 0.8, 0.6)).subdivide_to_size(0.05)
+    vertices = np.array(made.vertices) / np.linalg.norm(made.vertices, axis=1).max()
+    surface = Surface(vertices * settings.extent / 2, np.array(made.faces))
+    cameras = make_cameras(settings, surface.vertices)
+    material = make_material(vertices, vertex_normals(surface), settings.strength, np.random.default_rng(1))
+    lights = make_lights(settings, cameras, np.random.default_rng(2))
+    return render_capture(settings, Scene(surface, material, cameras, lights))[0], lights
+
+
+def test_flat_sides_are_taken_to_be_under_one_rig(monkeypatch: pytest.MonkeyPatch) -> None:
+    capture, truth = box()
+    surface = visual_hull(signed_distance(capture, default_cells(capture)))
+    found = uncalibrated_lights(capture, surface, 0).lights
+    assert found.one_rig and light_error(found, truth) < 10
+    # Three factors explain three sides whatever reflects: by the variances alone every view has lights of its own, and wrong ones.
+    monkeypatch.setattr(calibrate, "_mostly_fixed", lambda *_: True)
+    alone = uncalibrated_lights(capture, surface, 0).lights
+    assert not alone.one_rig and light_error(alone, truth) > 2 * light_error(found, truth)
+
+
+def test_a_rough_shape_that_faces_one_way_tells_no_lights(scene: SphereScene) -> None:
+    capture, _, _ = lambertian(scene)
+    view = capture.views[0]
+    corners = 3 * RADIUS * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) @ view.camera.rotation
+    with pytest.raises(CaptureError, match="normals point many ways, given one where they all lie in one plane"):
+        uncalibrated_lights(capture.select({view.name: view.lights}), Surface(corners, np.array([[0, 2, 1], [0, 3, 2]])), 0)
 
 
 def test_ambiguity_is_undone_among_wrong_normals() -> None:
