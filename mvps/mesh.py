@@ -11,6 +11,10 @@ from scipy.sparse.csgraph import connected_components
 
 from mvps.scene import Bool, Float, Int, Surface
 
+KNIFE_EDGE = 90.0
+"""Degrees that a surface turns by across an edge that remeshing keeps: where two sides of a thin part meet, relaxing would draw vertices
+off their edge, and the nearest point of the surface is then on a side. What is smooth turns by less over an edge's length."""
+
 
 def face_cross(surface: Surface) -> Float:
     """(F, 3) cross product of two edges of every face: outward normal times twice the area."""
@@ -164,12 +168,19 @@ def unbiased(surface: Surface) -> Surface:
 
 
 def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) -> Surface:
-    """The surface with edges of about `edge_length` (split, collapse, flip, relax: Botsch and Kobbelt 2004)."""
+    """The surface with edges of about `edge_length` (split, collapse, flip, relax: Botsch and Kobbelt 2004). Edges across which
+    the surface turns by KNIFE_EDGE stay edges, and vertices on them stay there."""
     from gpytoolbox import remesh_botsch
 
     vertices: Any
     vertices, faces = remesh_botsch(
-        np.array(surface.vertices), np.array(surface.faces, dtype=np.int32), i=iterations, h=edge_length, project=True
+        np.array(surface.vertices),
+        np.array(surface.faces, dtype=np.int32),
+        i=iterations,
+        h=edge_length,
+        project=True,
+        detect_feature_edges=True,
+        feature_dihedral_threshold=KNIFE_EDGE,
     )
     return largest_component(Surface(vertices, faces))
 

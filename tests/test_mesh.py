@@ -4,6 +4,7 @@ import igl
 import numpy as np
 import trimesh
 from references import is_closed, signed_volume
+from scipy.spatial import Delaunay
 
 from mvps import mesh
 from mvps.scene import Surface
@@ -57,6 +58,31 @@ def test_remeshing_reaches_the_edge_length_and_stays_closed_on_the_surface() -> 
     assert abs(mesh.mean_edge_length(fine) - 0.15) < 0.02
     assert is_closed(fine) and signed_volume(fine) > 0
     assert np.abs(np.linalg.norm(fine.vertices, axis=1) - 2).max() < 0.02
+
+
+def lens() -> Surface:
+    """Two lids that meet in a sharp rim of radius 1."""
+    rings = [r * np.exp(2j * np.pi * np.arange(60 * r) / (60 * r)) for r in np.linspace(0.1, 1, 10)]
+    flat = np.concatenate([[0], *rings])
+    faces = Delaunay(np.column_stack([flat.real, flat.imag])).simplices
+    a, b, c = flat[faces].T
+    faces[((b - a) * (c - a).conj()).imag > 0] = faces[((b - a) * (c - a).conj()).imag > 0][:, ::-1]
+    inside = abs(flat) < 0.999
+    below = np.where(inside, len(flat) + np.cumsum(inside) - 1, np.arange(len(flat)))
+    height = np.concatenate([0.1 * (1 - abs(flat) ** 2), -0.1 * (1 - abs(flat[inside]) ** 2)])
+    both = np.concatenate([flat, flat[inside]])
+    return Surface(np.column_stack([both.real, both.imag, height]), np.concatenate([faces, below[faces[:, ::-1]]]))
+
+
+def test_remeshing_keeps_the_sharp_rim_of_a_thin_part() -> None:
+    thin = lens()
+    assert is_closed(thin) and signed_volume(thin) > 0
+    meshed = thin
+    for _ in range(3):
+        meshed = mesh.isotropic_remesh(meshed, 0.08)
+    # Where vertices slide off the rim, a seventh of the area is lost.
+    assert is_closed(meshed) and np.isclose(mesh.face_areas(meshed).sum(), mesh.face_areas(thin).sum(), rtol=0.01)
+    assert np.isclose(np.linalg.norm(meshed.vertices[:, :2], axis=1).max(), 1, atol=0.01)
 
 
 def test_largest_component_is_kept_and_unused_vertices_go() -> None:

@@ -165,9 +165,7 @@ def _moved(
         place = surface.vertices + agreed.offset[:, None] * vertex_normals(surface)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target.normal, agreed, target.sigma, factor)
-    known = np.zeros(len(surface.vertices), bool)
-    known[np.concatenate(seen)] = True
-    return Moved(closed_over(unbiased(surface), known, capture, distance), place, agreed.sigma)
+    return Moved(closed_over(unbiased(surface), seen, capture, distance), place, agreed.sigma)
 
 
 def _remeshed(
