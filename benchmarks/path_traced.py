@@ -46,6 +46,10 @@ CASES = {
     "statue-dark": Case("statue", "dark", SceneSettings(seed=7)),
     "coral-cloth": Case("coral", "cloth", SceneSettings(seed=8, views=6, lights=8)),
     "knot-plastic": Case("knot", "plastic", SceneSettings(seed=9)),
+    "shell-gilded": Case("shell", "gilded", SceneSettings(seed=11)),
+    "cheese-chalk": Case("cheese", "chalk", SceneSettings(seed=15)),
+    "bricks-plastic": Case("bricks", "plastic", SceneSettings(seed=16)),
+    "statue-chalk": Case("statue", "chalk", SceneSettings(seed=31)),
 }
 
 

@@ -137,6 +137,9 @@ def reconstruct(
         start = replace(start, maps=()) if halvings(used) else start
         plan, name = parts.of(last_pass(settings.preset, free, far)), "joint refinement"
         refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
+        if lights is None and not free and start.status != "converged":
+            # Lights that stay where they still turned have not settled.
+            refined = replace(refined, status=start.status, text=start.text)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, chosen_device(settings.device))
         pictures = normal_pictures(capture, used, refined)

@@ -7,6 +7,8 @@ Shapes are zero sets of functions f of x in the unit ball, negative inside; s(f,
     vessel    a solid of revolution, hollow from the top, with two rings for handles
     coral     tubes along bent branches that start in the middle, with ripples
     shell     a ball with spiral ridges
+    cheese    a ball with round hollows
+    bricks    three blocks on each other: all sides flat
 
 A photograph is the radiance of paths up to BOUNCES segments under one directional light, PATHS of them a sub-pixel; imported only where
 Mitsuba is there (pip install mvps[mitsuba]).
@@ -129,12 +131,33 @@ def shell(x: Float) -> Float:
     return np.asarray((distance - 0.8 - 0.05 * np.cos(2 * azimuth + 16 * x[:, 2] / 0.8)) * 0.7)
 
 
+def cheese(x: Float) -> Float:
+    """Six hollows, each the inside of a ball, as deep as they are wide at most."""
+    hollows = [(0.8, 0.0, 0.0), (-0.5, 0.6, 0.2), (0.0, -0.8, 0.2), (0.2, 0.3, 0.75), (-0.4, -0.4, -0.6), (-0.6, -0.3, 0.5)]
+    away = np.min([np.linalg.norm(x - np.array(centre), axis=-1) for centre in hollows], axis=0)
+    return np.asarray(np.maximum(np.linalg.norm(x, axis=-1) - 0.8, 0.32 - away))
+
+
+def block(x: Float, centre: tuple[float, float, float], half: tuple[float, float, float]) -> Float:
+    """The distance to a box around centre."""
+    beyond = np.abs(x - np.array(centre)) - np.array(half)
+    return np.asarray(np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0))
+
+
+def bricks(x: Float) -> Float:
+    """A pile that overhangs."""
+    blocks = [((0.0, 0.0, -0.45), (0.6, 0.4, 0.2)), ((0.1, 0.05, -0.05), (0.35, 0.35, 0.2)), ((-0.05, 0.0, 0.4), (0.2, 0.5, 0.25))]
+    return np.asarray(np.min([block(x, *one) for one in blocks], axis=0))
+
+
 SHAPES: dict[str, Callable[[], Function]] = {
     "statue": lambda: statue,
     "knot": knot,
     "vessel": lambda: vessel,
     "coral": coral,
     "shell": lambda: shell,
+    "cheese": lambda: cheese,
+    "bricks": lambda: bricks,
 }
 
 
@@ -166,6 +189,16 @@ MATERIALS: dict[str, tuple[dict[str, Any], list[list[float]]]] = {
         },
         [[0.25, 0.45, 0.38], [0.3, 0.5, 0.45], [0.35, 0.3, 0.25]],
     ),
+    "gilded": (
+        {
+            "type": "blendbsdf",
+            "weight": {"type": "mesh_attribute", "name": "vertex_worn"},
+            "paint": {"type": "principled", "base_color": COLOURED, "roughness": 0.4, "specular": 0.5},
+            "metal": {"type": "roughconductor", "material": "Au", "alpha": 0.25, "distribution": "ggx"},
+        },
+        [[0.1, 0.12, 0.3], [0.3, 0.08, 0.08]],
+    ),
+    "chalk": ({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.8, 0.8, 0.75]}}, PAINT),
     "dark": (
         {"type": "principled", "base_color": COLOURED, "roughness": 0.25, "specular": 0.6},
         [[0.06, 0.05, 0.05], [0.1, 0.08, 0.06], [0.04, 0.05, 0.07]],
