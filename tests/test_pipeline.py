@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
 from sphere_scene import RADIUS, make_sphere
 
-from mvps import evaluate, reconstruct
+from mvps import coarse, evaluate, reconstruct
 from mvps.camera import pixel_footprint
 from mvps.coarse import MOST_TURNS, in_turn, shaped
 from mvps.command import run
 from mvps.export import read_reconstruction
+from mvps.material import POOR_FIT
 from mvps.measures import distance_to
 from mvps.occupancy import CONTINUED, OccupancySettings
 from mvps.progress import Progress
@@ -138,6 +141,21 @@ def test_a_hull_that_is_good_enough_goes_without_the_occupancy_field() -> None:
     assert field["status"].startswith("skipped: views moved the hull by 0.")
     pixel = pixel_footprint([view.camera for view in scene.capture.views], np.zeros(3))
     assert np.abs(np.linalg.norm(found.surface.vertices, axis=1) - RADIUS).mean() < 0.1 * pixel
+
+
+@pytest.mark.parametrize("residual", [0.2, 0.05])
+def test_lights_that_stay_where_they_turned_have_not_settled(residual: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the model fits badly before the last rounds these keep the lights, whose last step is then none."""
+    scene, made = make_sphere(5), coarse.coarse
+
+    def turning(*given: Any) -> Any:
+        start, rounds = made(*given)
+        turned = [*start.rounds[:-1], {**start.rounds[-1], "residual": residual}]
+        return replace(start, status="not settled", text="Lights turned.", rounds=turned), rounds
+
+    monkeypatch.setattr(coarse, "coarse", turning)
+    found = reconstruct.reconstruct(scene.capture, Settings("ball"), None, Progress()).metrics["status"]
+    assert ("Lights turned." in found["text"]) == (residual > POOR_FIT) and (residual <= POOR_FIT or found["name"] == "not settled")
 
 
 def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> None:
