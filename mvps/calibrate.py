@@ -11,7 +11,9 @@ a hull's normals are exact near the silhouettes and far off in concavities.
 
 Where the lights stand still in the camera's frame (one rig), all pixels of all views are factorised together in camera frames.
 That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations. Of a view that
-shows three flat sides three factors explain anything, and its normals fix no A: from most views so, one rig is believed.
+shows three flat sides three factors explain anything, and its normals fix no A: from most views so, one rig is believed. A is fixed where
+the second eigenvalue of the 9 x 9 matrix over its inliers, at the solved A, is above what the last scale of rho lets pass; where it is not,
+albedo a_p and s_l are solved in turn in I_pl = a_p n_p . s_l.
 
 Metals have no diffuse body, and the factors say nothing: where highlights explain the images better than Lambert's law does, the lights
 are those by correlation (correlation.py).
@@ -64,19 +66,25 @@ class Calibration:
 
     residual: relative RMS that three factors leave; fourth_singular_value: over the first one. Both are 0.05 to 0.15 on matte and glossy
     objects, above 0.25 where there is no diffuse body, and NaN where there are too few lights to factorise. metallic: the lights are those
-    by correlation (correlation.py), and photometric stereo by Lambert's law would say nothing.
+    by correlation (correlation.py), and photometric stereo by Lambert's law would say nothing. assumed: one rig was believed because single
+    views tell nothing of their lights; under_normals: of some or all lights the rough shape's normals did not fix the ambiguity, so that
+    these are the lights under the normals as they are.
     """
 
     lights: Lights
     residual: float
     fourth_singular_value: float
     metallic: bool = False
+    assumed: bool = False
+    under_normals: bool = False
 
     def words(self) -> str:
         """How the lights were found."""
         kind = "one rig for all views" if self.lights.one_rig else "lights of every view on their own"
         if math.isnan(self.residual):
             return f"{kind}, from the rough shape's normals"
+        kind += ", which do not tell them one by one" if self.assumed else ""
+        kind += ", from the rough shape's normals where these leave them open" if self.under_normals else ""
         return f"{kind}; three factors leave {100 * self.residual:.1f} % of the images"
 
 
@@ -192,15 +200,15 @@ def _mostly_fixed(separate: list[Factorisation], samples: list[_Sampled]) -> boo
     return 2 * sum(A is not None for A in on_cores(lambda f, s: _ambiguity(f, [s]), separate, samples)) > len(samples)
 
 
-def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> Float:
-    """(lights, 3) intensity times direction in the frame of the samples' normals."""
+def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> tuple[Float, bool]:
+    """(lights, 3) intensity times direction in the frame of the samples' normals, and whether these did not fix the ambiguity."""
     A = _ambiguity(factors, samples)
     albedo, lights = (
         _under_normals(samples) if A is None else (np.linalg.norm(factors.left @ A.T, axis=1), factors.right @ np.linalg.inv(A))
     )
     # The median albedo is the unit, so that lights of separately solved views share one scale.
     scaled: Float = lights * np.median(albedo * np.concatenate([s.bright for s in samples]))
-    return _without_gaps(scaled)
+    return _without_gaps(scaled), A is None
 
 
 def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
@@ -294,14 +302,15 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
         if alike or not _mostly_fixed(separate, samples):
             image, seen = (np.concatenate(parts) for parts in zip(*((s.absolute, s.normal) for s in samples), strict=True))
             metallic = is_glossy([image], [seen], generator)
-            rig = glossy_lights(image, seen) if metallic else _scaled_lights(together, samples)
+            rig, left_open = (glossy_lights(image, seen), False) if metallic else _scaled_lights(together, samples)
             lights = _assemble(capture, [rig] * len(samples), True)
-            return Calibration(lights, together.residual, float(together.singular_values[3]), metallic)
+            return Calibration(lights, together.residual, float(together.singular_values[3]), metallic, not alike, left_open)
     if is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator):
         scaled = [glossy_lights(s.absolute, s.normal) for s in samples]
         return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
-    scaled = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
-    return Calibration(_assemble(capture, scaled, False), residual, fourth)
+    each = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
+    left_open = any(is_open for _, is_open in each)
+    return Calibration(_assemble(capture, [scaled for scaled, _ in each], False), residual, fourth, under_normals=left_open)
 
 
 def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:

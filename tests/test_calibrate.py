@@ -155,8 +155,10 @@ def box() -> tuple[Capture, Lights]:
 def test_flat_sides_are_taken_to_be_under_one_rig(monkeypatch: pytest.MonkeyPatch) -> None:
     capture, truth = box()
     surface = visual_hull(signed_distance(capture, default_cells(capture)))
-    found = uncalibrated_lights(capture, surface, 0).lights
+    calibration = uncalibrated_lights(capture, surface, 0)
+    found = calibration.lights
     assert found.one_rig and light_error(found, truth) < 10
+    assert calibration.assumed and "one rig for all views, which do not tell them one by one" in calibration.words()
     # Three factors explain three sides whatever reflects: by the variances alone every view has lights of its own, and wrong ones.
     monkeypatch.setattr(calibrate, "_mostly_fixed", lambda *_: True)
     alone = uncalibrated_lights(capture, surface, 0).lights

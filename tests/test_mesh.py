@@ -66,7 +66,8 @@ def lens() -> Surface:
     flat = np.concatenate([[0], *rings])
     faces = Delaunay(np.column_stack([flat.real, flat.imag])).simplices
     a, b, c = flat[faces].T
-    faces[((b - a) * (c - a).conj()).imag > 0] = faces[((b - a) * (c - a).conj()).imag > 0][:, ::-1]
+    clockwise = ((b - a) * (c - a).conj()).imag > 0
+    faces[clockwise] = faces[clockwise][:, ::-1]
     inside = abs(flat) < 0.999
     below = np.where(inside, len(flat) + np.cumsum(inside) - 1, np.arange(len(flat)))
     height = np.concatenate([0.1 * (1 - abs(flat) ** 2), -0.1 * (1 - abs(flat[inside]) ** 2)])
