@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mvps.cores import neighbours
-from mvps.mesh import face_normals, mean_edge_length, vertex_normals
+from mvps.mesh import face_normals, vertex_normals
 from mvps.scene import Float, Int, Surface
 from mvps.visibility import RayCaster, cast_shadow, ray_caster
 
@@ -68,7 +68,7 @@ def gather(surface: Surface, size: float) -> Gather:
     _, vertex, patch = np.unique(key, return_index=True, return_inverse=True)
     normal, places = normals[vertex], surface.vertices[vertex]
     directions = _around(normal, _cosine_directions(RAYS))
-    origins = np.repeat(places + mean_edge_length(surface) / 2 * normal, RAYS, axis=0)
+    origins = np.repeat(places + caster.offset * normal, RAYS, axis=0)
     hits = caster.first_hits(origins, directions)
     # A ray that meets the back of a face started below a facet.
     seen = np.flatnonzero(hits.face >= 0)

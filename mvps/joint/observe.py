@@ -4,10 +4,10 @@ A vertex takes part in a view that sees it; its sample under light l is the bili
 
     I_l = mean over channels of radiance_c / ratio_lc,     ratio = intensity over its mean over the channels,
 
-so that what is left of a light is one number, its mean intensity. Samples that are saturated or whose light another part of the mesh
-hides are no data. A pair (vertex, view) is weighted by cos^2 of the viewing angle (a pixel covers 1 / cos of the surface, and an error of
-the position moves the projection by as much again), times the part of its four pixels that is foreground at least one pixel away from the
-mask's boundary, where pixels mix object and background.
+so that what is left of a light is one number, its mean intensity. Samples that are saturated or whose light another part of the mesh hides
+are no data, nor are those beside them. A pair (vertex, view) is weighted by cos^2 of the viewing angle (a pixel covers 1 / cos of the
+surface, and an error of the position moves the projection by as much again), times the part of its four pixels that is foreground at least
+one pixel away from the mask's boundary, where pixels mix object and background.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
 from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
-from mvps.visibility import RayCaster, cast_shadow, ray_caster, visible_vertices
+from mvps.visibility import RayCaster, beside_shadow, ray_caster, visible_vertices
 
 SAMPLES_PER_CHUNK = 1 << 17
 """Samples handled at once: smaller chunks wait for the interpreter, larger ones leave the processor's last cache (docs/method.md)."""
@@ -38,6 +38,13 @@ SAMPLES_PER_LAUNCH = 1 << 21
 
 LIGHTEST_PAIR = 1e-3
 """A pair of less weight (seen at over 88 degrees, or on a silhouette) is left out."""
+
+SHADOW_MARGIN = 2
+"""Pixels, or edges of the mesh, beside a cast shadow that are no data either: a pixel mixes what is on both sides of the border, and the
+mesh says where that is to about another."""
+
+HIDDEN_MARGIN = 1
+"""Edges between what a view sees and what another part hides from it: their pixels mix both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +133,7 @@ def _sampled(
 def _pairs(view: View, caster: RayCaster, among: Bool | None = None) -> tuple[Int, Float, Int, Float]:
     """Vertices (n,) that a view sees, with the weight of the pair (n,) and the bilinear positions and weights (n, 4). among (V,): only
     these."""
-    visible = visible_vertices(caster, view.camera)
+    visible = visible_vertices(caster, view.camera, HIDDEN_MARGIN)
     vertex = np.flatnonzero(visible if among is None else visible & among)
     points, normal = caster.surface.vertices[vertex], caster.vertex_normals[vertex]
     positions, weights = bilinear(view.pixel_index, project(view.camera, points)[0])
@@ -155,7 +162,7 @@ def observe(
         towards = view_directions(view.camera, surface.vertices[vertex])
         image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
         if shadows:
-            usable &= ~cast_shadow(caster, vertex, lights.direction[i])
+            usable &= ~beside_shadow(caster, vertex, lights.direction[i], SHADOW_MARGIN)
         return ViewSamples(
             torch.from_numpy(vertex).to(device),
             torch.from_numpy(towards.astype(np.float32)).to(device),

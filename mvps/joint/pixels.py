@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from mvps.camera import view_directions
 from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
 from mvps.joint.blocks import DirectionalLights, Vertices
-from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance
+from mvps.joint.observe import SHADOW_MARGIN, ViewSamples, channel_ratio, grey_radiance
 from mvps.joint.steps import Anchor, confidence, vertex_step
 from mvps.joint.thinned import kept
 from mvps.mesh import normalise
@@ -56,6 +57,17 @@ def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: 
     return ViewSamples(torch.arange(n, device=device), towards_, torch.ones(n, device=device), image_, data_)
 
 
+def _beside(view: View, rows: Int, shadow: Bool) -> Bool:
+    """(n, lights) True where one of the view's pixels, rows (n,), or one within SHADOW_MARGIN of it is in shadow (n, lights)."""
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * SHADOW_MARGIN + 1,) * 2)
+    beside, place = np.zeros_like(shadow), tuple(view.pixels[rows].T)
+    image = np.zeros(view.mask.shape, np.uint8)
+    for k, of_light in enumerate(shadow.T):
+        image[place] = of_light
+        beside[:, k] = cv2.dilate(image, disk)[place]
+    return beside
+
+
 def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
     """(n, 3) share of the channels in a pixel's radiance under white light, mean 1."""
     samples, per_channel = view.samples[rows], (view.shown[:, None] / channel_ratio(intensity)).astype(np.float32)
@@ -84,7 +96,7 @@ def pixel_normals(
     points = points_under(caster, material, view.camera, view.pixels[chosen])
     hit = np.flatnonzero(points.hit)
     rows, shadow = chosen[hit], shadow_at(caster, material.law, points, direction)[hit]
-    samples = _samples(view, points.position[hit], shadow, intensity, rows, device)
+    samples = _samples(view, points.position[hit], _beside(view, rows, shadow), intensity, rows, device)
     if sent is not None:
         G = at(sent.sources, terms(sent, direction, view.camera.centre), points.position[hit], points.mesh_normal[hit])
         samples = replace(samples, gathered=torch.from_numpy(G).to(device))
