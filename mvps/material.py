@@ -99,8 +99,8 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
 
 
 def gained(before: Float, after: Float) -> tuple[float, float]:
-    """Gain and noise, as above, of errors (n,) over errors (n,); 0 where no vertex has both."""
-    both = (before > 0) & (after > 0)
+    """Gain and noise, as above, of errors (n,) over errors (n,), of those that differ; 0 where none do."""
+    both = (before > 0) & (after > 0) & (before != after)
     ratio = np.log(before[both] / after[both])
     return (float(ratio.mean()), float(ratio.std() / np.sqrt(len(ratio)))) if len(ratio) else (0.0, 0.0)
 

@@ -151,19 +151,30 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
     return shadows(caster, caster.surface.vertices[vertices], caster.vertex_normals[vertices], lights)
 
 
-def beside_shadow(caster: RayCaster, vertices: Int, lights: Float, margin: int) -> Bool:
-    """`cast_shadow` of vertices (n,) or of one within `margin` edges of them: (n, lights)."""
-    beside = caster.around[vertices]
+class Shade(NamedTuple):
+    """Of n vertices and some lights, (n, lights) each: beside, whether a vertex or one near it is in cast shadow; deep, whether it is
+    itself, and none near it is lit."""
+
+    beside: Bool
+    deep: Bool
+
+
+def shade_of(caster: RayCaster, vertices: Int, lights: Float, margin: int) -> Shade:
+    """Cast shadows of vertices (n,), indices, with what is within `margin` edges of them."""
+    around = caster.around[vertices]
     for _ in range(margin - 1):
-        beside = beside @ caster.around
-    near = np.unique(beside.indices)
-    beside, shadow = beside[:, near], cast_shadow(caster, near, lights)
-    found = np.zeros((len(vertices), len(lights)), bool)
+        around = around @ caster.around
+    near = np.unique(around.indices)
+    around, shadow = around[:, near], cast_shadow(caster, near, lights)
+    own, facing = np.searchsorted(near, vertices), caster.vertex_normals[near] @ lights.T > 0
+    beside, deep = np.zeros((2, len(vertices), len(lights)), bool)
     step = max(1, RAYS_PER_CALL // max(1, len(near)))
     for start in range(0, len(lights), step):
         part = slice(start, start + step)
-        found[:, part] = beside @ shadow[:, part].astype(np.float32) > 0
-    return found
+        dark = shadow[:, part]
+        beside[:, part] = around @ dark.astype(np.float32) > 0
+        deep[:, part] = dark[own] & ~(around @ (facing[:, part] & ~dark).astype(np.float32) > 0)
+    return Shade(beside, deep)
 
 
 def shadows(caster: RayCaster, points: Float, normal: Float, lights: Float) -> Bool:

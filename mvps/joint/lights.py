@@ -39,6 +39,7 @@ from mvps.joint.blocks import (
 )
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
+from mvps.joint.shadowed import of_shadows
 from mvps.joint.steps import LARGEST_TURN, Anchor
 from mvps.scene import Law
 from mvps.shading import returned
@@ -239,14 +240,19 @@ def light_step(
     one_rig: bool,
     free: tuple[bool, bool, bool, bool] = (True, True, True, True),
 ) -> tuple[list[DirectionalLights], Law]:
-    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated.
+    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated; bounce and gleam from the
+    shadows alone (shadowed.py) where these tell.
 
     rotations: camera_from_world of the views, float32.
     """
+    reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))).median())
+    told = of_shadows(views, vertices, lights, law, free[2:])
+    if told is not None:
+        law, free = _bounded(law, law.grazing, *told, reflected), (*free[:2], False, False)
     layout = _layout(lights, one_rig, free[0])
     step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free[1:])
-    reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))).median())
-    law = _stepped_law(law, step[-OF_LAW:], reflected)
+    grazing, bounce, gleam = step[-OF_LAW:].tolist()
+    law = _bounded(law, law.grazing + grazing, law.bounce + bounce, law.gleam + gleam, reflected)
     if not layout.lights:
         return lights, law
     stepped = []
@@ -261,12 +267,10 @@ def light_step(
     return stepped, law
 
 
-def _stepped_law(law: Law, step: Tensor, reflected: float) -> Law:
-    """The law after a step, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
-    before = torch.tensor([law.grazing, law.bounce, law.gleam], dtype=step.dtype)
-    grazing, *others = (before + step.cpu()).tolist()
+def _bounded(law: Law, grazing: float, bounce: float, gleam: float, reflected: float) -> Law:
+    """The law with these, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
     most = 1 / max(reflected, 1e-300)
-    bounce, gleam = (min(max(value, 0.0), most) for value in others)
+    bounce, gleam = (min(max(value, 0.0), most) for value in (bounce, gleam))
     return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=bounce, gleam=gleam)
 
 

@@ -28,7 +28,7 @@ from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
 from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
-from mvps.visibility import RayCaster, beside_shadow, ray_caster, visible_vertices
+from mvps.visibility import RayCaster, ray_caster, shade_of, visible_vertices
 
 SAMPLES_PER_CHUNK = 1 << 17
 """Samples handled at once: smaller chunks wait for the interpreter, larger ones leave the processor's last cache (docs/method.md)."""
@@ -52,8 +52,8 @@ class ViewSamples:
     """One view's samples of the n vertices it sees. All in torch; directions in the world frame.
 
     vertex (n,) index; towards (n, 3) unit vector to the camera; weight (n,) of the pair; image (n, lights) grey radiance;
-    data (n, lights) bool, False where saturated or in cast shadow; gathered (n, lights, terms) what other surfaces send
-    (gleam.py), None where that is not asked for.
+    data (n, lights) bool, False where saturated, in cast shadow or beside it; gathered (n, lights, terms) what other surfaces send
+    (gleam.py), None where that is not asked for; dark (n, lights) bool, True deep in cast shadow and not saturated, None without shadows.
     """
 
     vertex: Tensor
@@ -62,6 +62,7 @@ class ViewSamples:
     image: Tensor
     data: Tensor
     gathered: Tensor | None = None
+    dark: Tensor | None = None
 
     def gathered_of(self, part: slice) -> Tensor | None:
         """`gathered` of some pairs."""
@@ -69,8 +70,8 @@ class ViewSamples:
 
     def of_pairs(self, rows: Tensor) -> ViewSamples:
         """Only some of the pairs."""
-        gathered = None if self.gathered is None else self.gathered[rows]
-        return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered)
+        gathered, dark = (None if a is None else a[rows] for a in (self.gathered, self.dark))
+        return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered, dark)
 
     def of_vertices(self, some: Tensor, count: int) -> ViewSamples:
         """Only the pairs of some of the mesh's `count` vertices, indices (n,)."""
@@ -80,9 +81,9 @@ class ViewSamples:
 
     def of_lights(self, rows: slice | Tensor) -> ViewSamples:
         """Only some of the lights."""
-        image, data, gathered = (None if a is None else a[:, rows].contiguous() for a in (self.image, self.data, self.gathered))
-        assert image is not None and data is not None
-        return ViewSamples(self.vertex, self.towards, self.weight, image, data, gathered)
+        gathered, dark = (None if a is None else a[:, rows].contiguous() for a in (self.gathered, self.dark))
+        image, data = (values[:, rows].contiguous() for values in (self.image, self.data))
+        return ViewSamples(self.vertex, self.towards, self.weight, image, data, gathered, dark)
 
     @property
     def pairs_at_once(self) -> int:
@@ -161,15 +162,13 @@ def observe(
         vertex, pair, positions, weights = _pairs(view, caster, among)
         towards = view_directions(view.camera, surface.vertices[vertex])
         image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
+        dark = None
         if shadows:
-            usable &= ~beside_shadow(caster, vertex, lights.direction[i], SHADOW_MARGIN)
-        return ViewSamples(
-            torch.from_numpy(vertex).to(device),
-            torch.from_numpy(towards.astype(np.float32)).to(device),
-            torch.from_numpy(pair.astype(np.float32)).to(device),
-            torch.from_numpy(image).to(device),
-            torch.from_numpy(usable).to(device),
-        )
+            shade = shade_of(caster, vertex, lights.direction[i], SHADOW_MARGIN)
+            usable, dark = usable & ~shade.beside, torch.from_numpy(usable & shade.deep).to(device)
+        of_pairs = (vertex, towards.astype(np.float32), pair.astype(np.float32), image, usable)
+        vertex_, towards_, pair_, image_, usable_ = (torch.from_numpy(values).to(device) for values in of_pairs)
+        return ViewSamples(vertex_, towards_, pair_, image_, usable_, dark=dark)
 
     return on_cores(one, range(len(capture.views)))
 

@@ -16,6 +16,7 @@ from mvps.joint.blocks import DirectionalLights, Vertices, batches, evaluate
 from mvps.joint.lights import light_step
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
+from mvps.joint.shadowed import in_shadow
 from mvps.joint.steps import Anchor, vertex_step
 from mvps.material import Model
 from mvps.scene import Float, Law
@@ -29,8 +30,9 @@ def parted(views: list[ViewSamples]) -> tuple[list[ViewSamples], list[ViewSample
     fitted, kept = [], []
     for i, samples in enumerate(views):
         back = (torch.arange(samples.image.shape[1], device=samples.image.device) + i) % HELD_OUT_EVERY == 0
-        fitted.append(replace(samples, data=samples.data & ~back))
-        kept.append(replace(samples, data=samples.data & back))
+        dark = samples.dark
+        fitted.append(replace(samples, data=samples.data & ~back, dark=None if dark is None else dark & ~back))
+        kept.append(replace(samples, data=samples.data & back, dark=None if dark is None else dark & back))
     return fitted, kept
 
 
@@ -44,7 +46,8 @@ def held_out_errors(
     law: Law,
     model: Model,
 ) -> Float:
-    """(V,) mean absolute error of the held-out samples over their mean value, NaN for a vertex without any.
+    """(2 V,) mean absolute error of a vertex's held-out samples over their mean value, then of those deep in cast shadow; NaN where it has
+    none.
 
     start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope. law: its
     lobes' kind; the model says the rest.
@@ -62,11 +65,18 @@ def held_out_errors(
         _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, (False, *law_free))
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
+    shadowed = [in_shadow(samples) for samples in kept]
+    return np.concatenate([_errors(kept, state, lights, law, False), _errors(shadowed, state, lights, law, True)])
+
+
+def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, in_shadow: bool) -> Float:
+    """(V,) mean absolute error over the samples' mean value, NaN for a vertex without any; in_shadow: nothing but what surfaces send."""
     error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)
-    for batch in batches(kept, lights):
+    for batch in batches(views, lights):
         index = batch.vertex
         shaded = evaluate(state.normal[index], state.reflectance[index], batch.towards, batch.lights, law, batch.gathered)
-        batch.added(error, (batch.weight * (shaded.predicted - batch.image).abs()).sum(-1))
+        predicted = shaded.rest if in_shadow else shaded.predicted
+        batch.added(error, (batch.weight * (predicted - batch.image).abs()).sum(-1))
         batch.added(level, (batch.weight * batch.image).sum(-1))
     ratio = (error / level).double().cpu().numpy()
     return np.where(level.cpu().numpy() > 0, ratio, np.nan)
