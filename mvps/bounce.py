@@ -19,13 +19,17 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mvps.cores import neighbours
-from mvps.mesh import face_normals, vertex_normals
+from mvps.mesh import face_normals, mean_edge_length, vertex_normals
 from mvps.scene import Float, Int, Surface
 from mvps.visibility import RayCaster, cast_shadow, ray_caster
 
 RAYS = 128
 """Rays of a patch: the mean over an occluded tenth of the hemisphere is then known to about 25 %, over the patches that a point
 interpolates to 12 %, of an effect of some per cent."""
+
+LIFT_EDGES = 0.01
+"""Height at which these rays start, over the mean of the mesh's edges. What a point has beside it is mostly lit where it is itself, so that
+from a fifth of an edge's height on a hollow's lit side lacked 2.5 % and its dark side had 5 % too much (docs/method.md)."""
 
 BOUNCES = 3
 """What is left after three is below r^4 of the occluded part: 0.1 % for a white bowl, nothing elsewhere."""
@@ -68,7 +72,7 @@ def gather(surface: Surface, size: float) -> Gather:
     _, vertex, patch = np.unique(key, return_index=True, return_inverse=True)
     normal, places = normals[vertex], surface.vertices[vertex]
     directions = _around(normal, _cosine_directions(RAYS))
-    origins = np.repeat(places + caster.offset * normal, RAYS, axis=0)
+    origins = np.repeat(places + LIFT_EDGES * mean_edge_length(surface) * normal, RAYS, axis=0)
     hits = caster.first_hits(origins, directions)
     # A ray that meets the back of a face started below a facet.
     seen = np.flatnonzero(hits.face >= 0)
