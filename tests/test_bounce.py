@@ -8,6 +8,7 @@ import trimesh
 from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, sources_on
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Surface
+from mvps.visibility import cast_shadow
 
 
 def occupied(of: Gather) -> np.ndarray:
@@ -37,8 +38,27 @@ def test_a_convex_body_sends_itself_nothing() -> None:
 
 
 def test_inside_a_closed_surface_other_surfaces_fill_every_hemisphere() -> None:
-    # Rays start half an edge off the surface and may leave between facets only there.
+    # Rays start beside the surface and may leave between facets only there.
     assert np.abs(occupied(gather(hollow(), 3.0)) - 1).max() < 0.02
+
+
+def test_every_place_in_a_part_of_a_ball_sees_the_same_share_of_it_and_its_lit_parts() -> None:
+    """Between two places of a ball's inside the form factor is that of their areas, wherever they are: h / 2 R for all of a cap of height
+    h; and under any light the whole cap receives the same from its walls (the integrating sphere)."""
+    inside = hollow()
+    low = (inside.vertices[inside.faces][..., 2] < 0).all(1)
+    used, number = np.unique(inside.faces[low], return_inverse=True)
+    cap = Surface(inside.vertices[used], number.reshape(-1, 3))
+    of = gather(cap, 1.0)
+    place = cap.vertices[of.vertex]
+    deep = place[:, 2] < -1.0
+    height = 10.0 + cap.vertices[:, 2].max()
+    assert abs(occupied(of)[deep].mean() / (height / 20.0) - 1) < 0.03
+    light = np.array([[0.6, 0.0, 0.8]])
+    dark = cast_shadow(of.caster, of.vertex, light)[:, 0]
+    received = gathered(sources_on(of, cap, np.ones(len(cap.vertices))), light, 0.0)[:, 0]
+    assert (deep & dark).sum() > 50 and (deep & ~dark).sum() > 50
+    assert abs(received[deep & dark].mean() / received[deep & ~dark].mean() - 1) < 0.04
 
 
 def test_bounces_in_a_closed_white_furnace_add_up_to_the_geometric_series() -> None:

@@ -18,9 +18,9 @@ from mvps.joint import vertices
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
-from mvps.joint.observe import ViewSamples, observe
+from mvps.joint.observe import SHADOW_MARGIN, ViewSamples, observe
 from mvps.joint.photometry import grey_lights, of_one_normal
-from mvps.joint.pixels import all_pixel_normals, filled
+from mvps.joint.pixels import _beside, all_pixel_normals, filled
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.steps import free_reflectance, vertex_step
@@ -146,6 +146,17 @@ def test_pixels_keep_the_normals_that_explain_them(scene: SphereScene) -> None:
         degrees(m.normal, truth[view.mask]) for m, truth, view in zip(again, reconstruction.normal_maps, scene.capture.views, strict=True)
     ]
     assert np.median(np.concatenate(errors)) < 1.0
+
+
+def test_pixels_beside_a_shadow_are_those_within_two_of_one_in_it(scene: SphereScene) -> None:
+    view = scene.capture.views[0]
+    rng = np.random.default_rng(0)
+    rows = np.sort(rng.permutation(len(view.pixels))[: len(view.pixels) // 2])
+    shadow = rng.random((len(rows), 3)) < 0.01
+    place = view.pixels[rows]
+    apart = ((place[:, None] - place[None]) ** 2).sum(2)
+    slow = np.stack([(apart[:, of_light] < (SHADOW_MARGIN + 0.5) ** 2).any(1) for of_light in shadow.T], 1)
+    assert np.array_equal(_beside(view, rows, shadow), slow) and shadow.sum() < slow.sum() < slow.size
 
 
 def test_pixels_between_solved_ones_take_what_these_differ_by_from_the_vertices(scene: SphereScene) -> None:

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from mvps.mesh import normalise, vertex_normals
-from mvps.scene import Surface
-from mvps.visibility import RayCaster, cast_shadow, interpolate
+from mvps.scene import Camera, Surface
+from mvps.visibility import RayCaster, cast_shadow, interpolate, shade_of, visible_vertices
 
 
 def sphere(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0)) -> Surface:
@@ -65,6 +65,54 @@ def test_a_small_sphere_casts_its_round_shadow_on_a_big_one() -> None:
     assert shadow[facing & (distance < 0.28)].all() and not shadow[facing & (distance > 0.32)].any()
     # Below the horizon the shadow is attached, not cast.
     assert not shadow[big.vertices[:, 2] < -0.1].any()
+
+
+def test_beside_a_shadow_and_deep_in_it_are_some_edges_from_its_border() -> None:
+    big, small = sphere(), sphere(0.3, (0, 0, 2))
+    both = Surface(np.concatenate([big.vertices, small.vertices]), np.concatenate([big.faces, small.faces + len(big.vertices)]))
+    light = np.array([[0.0, 0.0, 1.0]])
+    caster, chosen = RayCaster(both), np.arange(0, len(big.vertices), 3)
+    shade = shade_of(caster, chosen, light, 2)
+    distance = np.linalg.norm(big.vertices[chosen, :2], axis=1)
+    facing = big.vertices[chosen, 2] > 0.2
+    # An edge of the big one is 0.07 long, a row of them 0.06 wide.
+    assert shade.beside[facing & (distance < 0.4), 0].all() and not shade.beside[facing & (distance > 0.47), 0].any()
+    assert shade.deep[facing & (distance < 0.13), 0].all() and not shade.deep[facing & (distance > 0.2), 0].any()
+    assert not shade.deep[~facing].any()
+
+
+def test_what_is_beside_hidden_vertices_is_seen_only_without_a_margin() -> None:
+    big, small = sphere(), sphere(0.3, (0, 0, 2))
+    both = Surface(np.concatenate([big.vertices, small.vertices]), np.concatenate([big.faces, small.faces + len(big.vertices)]))
+    camera = Camera(np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.diag([1.0, -1, -1]), np.array([0, 0, 1000.0]), 100, 100)
+    caster, count = RayCaster(both), len(big.vertices)
+    # From so far away rays are parallel.
+    seen, clear = (visible_vertices(caster, camera, margin)[:count] for margin in (0, 1))
+    distance = np.linalg.norm(big.vertices[:, :2], axis=1)
+    facing = big.vertices[:, 2] > 0.2
+    lost = seen & ~clear
+    assert seen[facing & (distance > 0.32)].all() and not seen[facing & (distance < 0.28)].any()
+    assert lost.sum() > 10 and distance[lost].max() < 0.4 and not clear[facing & (distance < 0.32)].any()
+    # What only turns away hides nothing beside it.
+    assert np.array_equal(visible_vertices(RayCaster(big), camera, 0), visible_vertices(RayCaster(big), camera, 2))
+
+
+@pytest.mark.parametrize("tilt", [10, 25, 45, 70])
+def test_shadows_begin_where_they_do_under_grazing_light(tilt: float) -> None:
+    """A wall on a floor: its shadow ends height / tan(elevation) away, to within the mesh's edges."""
+    edge, height = 0.1, 1.0
+    x, y = np.meshgrid(np.arange(0, 8, edge), np.arange(0, 1, edge), indexing="ij")
+    floor = np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
+    n, rows = y.shape[1], len(x)
+    corner = (np.arange(rows - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    faces = np.concatenate([np.stack([corner, corner + n, corner + 1], 1), np.stack([corner + 1, corner + n, corner + n + 1], 1)])
+    wall = np.array([[-0.05, -9, -1], [-0.05, 9, -1], [-0.05, 9, height], [-0.05, -9, height]])
+    k = len(floor)
+    surface = Surface(np.concatenate([floor, wall]), np.concatenate([faces, [[k, k + 1, k + 2], [k, k + 2, k + 3]]]))
+    light = np.array([[-np.cos(np.radians(tilt)), 0, np.sin(np.radians(tilt))]])
+    shadow = cast_shadow(RayCaster(surface), np.arange(k), light)[:, 0]
+    end = floor[shadow, 0].max() + 0.05
+    assert abs(end - height / np.tan(np.radians(tilt))) < (1 + 0.4 / np.tan(np.radians(tilt))) * edge
 
 
 def test_a_convex_shape_casts_no_shadow_on_itself() -> None:

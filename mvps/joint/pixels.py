@@ -59,7 +59,8 @@ def _samples(view: View, position: Float, shadow: Bool, intensity: Float, rows: 
 
 def _beside(view: View, rows: Int, shadow: Bool) -> Bool:
     """(n, lights) True where one of the view's pixels, rows (n,), or one within SHADOW_MARGIN of it is in shadow (n, lights)."""
-    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * SHADOW_MARGIN + 1,) * 2)
+    x, y = np.indices((2 * SHADOW_MARGIN + 1,) * 2) - SHADOW_MARGIN
+    disk = (x**2 + y**2 < (SHADOW_MARGIN + 0.5) ** 2).astype(np.uint8)
     beside, place = np.zeros_like(shadow), tuple(view.pixels[rows].T)
     image = np.zeros(view.mask.shape, np.uint8)
     for k, of_light in enumerate(shadow.T):

@@ -1,0 +1,140 @@
+"""The strength of inter-reflection from cast shadows, in a bowl whose rim shades a part of it under every light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from mvps.gleam import coarse_senders
+from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.lights import light_step, subset
+from mvps.joint.observe import ViewSamples, observe, with_gathered
+from mvps.joint.patches import Patches, drawn_patches
+from mvps.joint.photometry import grey_lights
+from mvps.joint.shadowed import of_shadows
+from mvps.joint.steps import Anchor, free_reflectance
+from mvps.joint.trial import held_out_errors
+from mvps.material import Model, judged
+from mvps.mesh import normalise, vertex_normals
+from mvps.rendering import light_arriving, photograph, points_under
+from mvps.scene import Camera, Capture, Law, Lights, Material, Surface, View
+from mvps.visibility import ray_caster
+
+ALBEDO, BOUNCE = 0.4, 1.8
+RADIUS, DISTANCE, SIZE = 10.0, 60.0, 96
+CPU = torch.device("cpu")
+DIFFUSE = Law(())
+
+
+def bowl() -> Surface:
+    """The inside of a ball, open at the top."""
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    faces = np.array(ball.faces)[:, ::-1]
+    low = faces[(ball.vertices[faces][..., 2] < 0.2 * RADIUS).all(1)]
+    used, number = np.unique(low, return_inverse=True)
+    return Surface(np.array(ball.vertices)[used], number.reshape(-1, 3))
+
+
+def camera_above(tilt: float, turn: float) -> Camera:
+    backward = np.array([np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn), np.cos(tilt)])
+    right = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    rotation = np.stack([right, np.cross(-backward, right), -backward])
+    K = np.array([[2.2 * SIZE, 0, SIZE / 2], [0, 2.2 * SIZE, SIZE / 2], [0, 0, 1]])
+    return Camera(K, rotation, np.array([0, 0, DISTANCE]), SIZE, SIZE)
+
+
+class Seen:
+    """Four views of the bowl under six lights, and its samples with what its walls send under the true strength."""
+
+    def __init__(self) -> None:
+        surface = bowl()
+        count = len(surface.vertices)
+        material = Material(
+            vertex_normals(surface), np.full((count, 3), ALBEDO), np.zeros((count, 0)), np.zeros(0), np.ones(count), bounce=BOUNCE
+        )
+        caster, sent = ray_caster(surface), coarse_senders(surface, material, grey=True)
+        turn = np.arange(6) * np.pi / 3
+        direction = normalise(np.stack([np.cos(turn), np.sin(turn), np.full(6, 0.9)], 1))
+        intensity = np.linspace(0.8, 1.2, 6)[:, None] * np.ones(3)
+        views = []
+        every = np.argwhere(np.ones((SIZE, SIZE), bool))
+        for k in range(4):
+            camera = camera_above(0.25, 0.3 + k * np.pi / 2)
+            mask = points_under(caster, material, camera, every).hit.reshape(SIZE, SIZE)
+            arriving = light_arriving(coarse_senders(surface, material), direction, camera.centre)
+            image = photograph(caster, material, camera, np.argwhere(mask), direction, intensity, arriving)
+            scale = float(image.max()) / 60000
+            views.append(View(f"view_{k}", camera, mask, np.rint(image / scale).astype(np.uint16), scale, 65535, tuple(range(1, 7))))
+        self.surface, self.capture = surface, Capture("bowl", tuple(views))
+        self.lights = Lights((direction,) * 4, (intensity,) * 4, False)
+        self.grey: list[DirectionalLights] = grey_lights(self.lights, CPU)
+        assert sent is not None
+        samples = observe(self.capture, surface, self.lights, CPU)
+        self.samples: list[ViewSamples] = with_gathered(samples, self.capture, surface, sent, self.lights)
+        normal = torch.tensor(vertex_normals(surface), dtype=torch.float32)
+        self.vertices = Vertices(normal, torch.full((count, 1), ALBEDO), torch.full((count,), 0.01))
+
+
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    return Seen()
+
+
+def test_shadows_tell_how_strongly_walls_light_each_other(seen: Seen) -> None:
+    told = of_shadows(seen.samples, seen.vertices, seen.grey, replace(DIFFUSE, bounce=0.3), (True, True))
+    assert told is not None and abs(told[0] / BOUNCE - 1) < 0.05 and told[1] == 0
+
+
+def test_two_fifths_of_the_shadows_that_are_lit_do_not_change_that(seen: Seen) -> None:
+    g = torch.Generator().manual_seed(0)
+    wrong = [
+        replace(s, image=torch.where(torch.rand(s.image.shape, generator=g) < 0.4, s.image.new_tensor(ALBEDO), s.image))
+        for s in seen.samples
+    ]
+    told = of_shadows(wrong, seen.vertices, seen.grey, DIFFUSE, (True, True))
+    assert told is not None and abs(told[0] / BOUNCE - 1) < 0.25
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_the_photographs_unit_is_of_no_account(seen: Seen, unit: float) -> None:
+    other = [replace(s, image=unit * s.image, gathered=None if s.gathered is None else unit * s.gathered) for s in seen.samples]
+    vertices = replace(seen.vertices, reflectance=unit * seen.vertices.reflectance)
+    told = of_shadows(other, vertices, seen.grey, DIFFUSE, (True, True))
+    assert told is not None and abs(unit * told[0] / BOUNCE - 1) < 0.05
+
+
+def test_without_shadows_or_unknowns_nothing_is_told(seen: Seen) -> None:
+    few = [replace(s, dark=None if s.dark is None else s.dark & (torch.arange(len(s.dark))[:, None] < 2)) for s in seen.samples]
+    none = [replace(s, dark=None) for s in seen.samples]
+    for views in (few, none):
+        assert of_shadows(views, seen.vertices, seen.grey, DIFFUSE, (True, True)) is None
+    assert of_shadows(seen.samples, seen.vertices, seen.grey, DIFFUSE, (False, False)) is None
+
+
+def drawn(seen: Seen) -> tuple[Patches, list[ViewSamples], Vertices, Anchor, list[torch.Tensor]]:
+    """The problem on patches all over the bowl, and the views' rotations."""
+    normal = vertex_normals(seen.surface)
+    visible = torch.cat([s.vertex for s in seen.samples]).unique().numpy()
+    patches = drawn_patches(visible, seen.surface, normal, len(normal), np.random.default_rng(0), CPU)
+    few, part, tie = subset(seen.samples, seen.vertices, free_reflectance(seen.vertices.normal, 1.0, 1), patches.vertex)
+    return patches, few, part, tie, [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in seen.capture.views]
+
+
+def test_a_step_of_the_lights_takes_the_strength_from_the_shadows_and_stays(seen: Seen) -> None:
+    patches, few, part, tie, rotations = drawn(seen)
+    lights, law = light_step(few, part, seen.grey, DIFFUSE, tie, patches, rotations, False)
+    assert abs(law.bounce / BOUNCE - 1) < 0.05
+    turned = [torch.rad2deg(torch.arccos((a.direction * b.direction).sum(1).clamp(-1, 1))) for a, b in zip(lights, seen.grey, strict=True)]
+    assert float(torch.cat(turned).max()) < 0.5
+
+
+def test_inter_reflection_is_kept_where_shadows_hold_light(seen: Seen) -> None:
+    patches, few, part, tie, rotations = drawn(seen)
+    errors = [held_out_errors(few, part, seen.grey, tie, patches, rotations, DIFFUSE, Model(bounce=bounce)) for bounce in (False, True)]
+    in_shadow = slice(len(part.normal), None)
+    assert np.nanmedian(errors[0][in_shadow]) == 1 and np.nanmedian(errors[1][in_shadow]) < 0.1
+    assert judged("inter-reflection", *errors).kept
