@@ -15,7 +15,7 @@ from mvps.joint.lights import light_step, subset
 from mvps.joint.observe import ViewSamples, observe, with_gathered
 from mvps.joint.patches import Patches, drawn_patches
 from mvps.joint.photometry import grey_lights
-from mvps.joint.shadowed import of_shadows
+from mvps.joint.shadowed import bounce_in_shadow
 from mvps.joint.steps import Anchor, free_reflectance
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, judged
@@ -85,8 +85,8 @@ def seen() -> Seen:
 
 
 def test_shadows_tell_how_strongly_walls_light_each_other(seen: Seen) -> None:
-    told = of_shadows(seen.samples, seen.vertices, seen.grey, replace(DIFFUSE, bounce=0.3), (True, True))
-    assert told is not None and abs(told[0] / BOUNCE - 1) < 0.05 and told[1] == 0
+    told = bounce_in_shadow(seen.samples, seen.vertices, seen.grey, replace(DIFFUSE, bounce=0.3))
+    assert told is not None and abs(told / BOUNCE - 1) < 0.05
 
 
 def test_two_fifths_of_the_shadows_that_are_lit_do_not_change_that(seen: Seen) -> None:
@@ -95,24 +95,23 @@ def test_two_fifths_of_the_shadows_that_are_lit_do_not_change_that(seen: Seen) -
         replace(s, image=torch.where(torch.rand(s.image.shape, generator=g) < 0.4, s.image.new_tensor(ALBEDO), s.image))
         for s in seen.samples
     ]
-    told = of_shadows(wrong, seen.vertices, seen.grey, DIFFUSE, (True, True))
-    assert told is not None and abs(told[0] / BOUNCE - 1) < 0.25
+    told = bounce_in_shadow(wrong, seen.vertices, seen.grey, DIFFUSE)
+    assert told is not None and abs(told / BOUNCE - 1) < 0.25
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_photographs_unit_is_of_no_account(seen: Seen, unit: float) -> None:
     other = [replace(s, image=unit * s.image, gathered=None if s.gathered is None else unit * s.gathered) for s in seen.samples]
     vertices = replace(seen.vertices, reflectance=unit * seen.vertices.reflectance)
-    told = of_shadows(other, vertices, seen.grey, DIFFUSE, (True, True))
-    assert told is not None and abs(unit * told[0] / BOUNCE - 1) < 0.05
+    told = bounce_in_shadow(other, vertices, seen.grey, DIFFUSE)
+    assert told is not None and abs(unit * told / BOUNCE - 1) < 0.05
 
 
-def test_without_shadows_or_unknowns_nothing_is_told(seen: Seen) -> None:
+def test_without_shadows_nothing_is_told(seen: Seen) -> None:
     few = [replace(s, dark=None if s.dark is None else s.dark & (torch.arange(len(s.dark))[:, None] < 2)) for s in seen.samples]
     none = [replace(s, dark=None) for s in seen.samples]
     for views in (few, none):
-        assert of_shadows(views, seen.vertices, seen.grey, DIFFUSE, (True, True)) is None
-    assert of_shadows(seen.samples, seen.vertices, seen.grey, DIFFUSE, (False, False)) is None
+        assert bounce_in_shadow(views, seen.vertices, seen.grey, DIFFUSE) is None
 
 
 def drawn(seen: Seen) -> tuple[Patches, list[ViewSamples], Vertices, Anchor, list[torch.Tensor]]:
@@ -126,10 +125,12 @@ def drawn(seen: Seen) -> tuple[Patches, list[ViewSamples], Vertices, Anchor, lis
 
 def test_a_step_of_the_lights_takes_the_strength_from_the_shadows_and_stays(seen: Seen) -> None:
     patches, few, part, tie, rotations = drawn(seen)
-    lights, law = light_step(few, part, seen.grey, DIFFUSE, tie, patches, rotations, False)
+    lights, law = light_step(few, part, seen.grey, DIFFUSE, tie, patches, rotations, False, (True, True, True, False))
     assert abs(law.bounce / BOUNCE - 1) < 0.05
     turned = [torch.rad2deg(torch.arccos((a.direction * b.direction).sum(1).clamp(-1, 1))) for a, b in zip(lights, seen.grey, strict=True)]
     assert float(torch.cat(turned).max()) < 0.5
+    _, kept = light_step(few, part, seen.grey, replace(DIFFUSE, bounce=0.7), tie, patches, rotations, False, (True, True, False, False))
+    assert kept.bounce == 0.7
 
 
 def test_inter_reflection_is_kept_where_shadows_hold_light(seen: Seen) -> None:

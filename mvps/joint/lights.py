@@ -39,7 +39,7 @@ from mvps.joint.blocks import (
 )
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
-from mvps.joint.shadowed import of_shadows
+from mvps.joint.shadowed import bounce_in_shadow
 from mvps.joint.steps import LARGEST_TURN, Anchor
 from mvps.scene import Law
 from mvps.shading import returned
@@ -240,15 +240,15 @@ def light_step(
     one_rig: bool,
     free: tuple[bool, bool, bool, bool] = (True, True, True, True),
 ) -> tuple[list[DirectionalLights], Law]:
-    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated; bounce and gleam from the
-    shadows alone (shadowed.py) where these tell.
+    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated; bounce without gleam from
+    the shadows alone (shadowed.py) where these tell.
 
     rotations: camera_from_world of the views, float32.
     """
     reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))).median())
-    told = of_shadows(views, vertices, lights, law, free[2:])
+    told = bounce_in_shadow(views, vertices, lights, law) if free[2] and not free[3] else None
     if told is not None:
-        law, free = _bounded(law, law.grazing, *told, reflected), (*free[:2], False, False)
+        law, free = _bounded(law, law.grazing, told, law.gleam, reflected), (*free[:2], False, False)
     layout = _layout(lights, one_rig, free[0])
     step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free[1:])
     grazing, bounce, gleam = step[-OF_LAW:].tolist()
