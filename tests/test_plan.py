@@ -19,7 +19,7 @@ from mvps.synthetic.settings import SceneSettings
 
 @pytest.fixture(scope="module")
 def capture() -> Capture:
-    return render_capture(SceneSettings(views=5, lights=8, size=64))[0]
+    return render_capture(SceneSettings(views=5, lights=10, size=80))[0]
 
 
 def draft(capture: Capture, parts: Parts) -> Reconstruction:

@@ -138,7 +138,8 @@ def _of_chosen_model(
     # Light by way of lobes is tried when their weights are known.
     state.lobed = False
     lit = _lit(state, few, capture, state.lights, _senders(state, start))
-    kept, state.trials = choose(state.model, _errors(state, capture, lit, start, tie, patches), sharpen)
+    errors = _errors(state, capture, lit, start, tie, patches)
+    kept, state.trials = choose(state.model, lambda model: np.concatenate(errors(model)), sharpen)
     state.model = replace(kept, gleam=state.model.gleam)
     state.law = replace(law, sharpness=kept.sharpness, grazing=law.grazing * kept.grazing, bounce=law.bounce * kept.bounce)
     stay = [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
@@ -147,8 +148,8 @@ def _of_chosen_model(
 
 def _errors(
     state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, patches: Patches
-) -> Callable[[Model], Float]:
-    """The errors on held-out samples under a model, of the vertices of the first patches."""
+) -> Callable[[Model], tuple[Float, Float]]:
+    """The errors on held-out samples, lit and in shadow, under a model, of the vertices of the first patches."""
     patches = patches.first(TRIAL_VERTICES // VERTICES_OF_PATCH)
     few, part, tie = subset(few, start, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
@@ -167,7 +168,8 @@ def _count_lobes(
         start = time.perf_counter()
         lit = _lit(state, few, capture, state.lights, _senders(state, vertices))
         errors = _errors(state, capture, lit, vertices, anchor, patches)
-        trial = judged(name, errors(replace(state.model, gleam=False)), errors(state.model))
+        # Shadows do not tell what lobes send from what diffuse surfaces do.
+        trial = judged(name, errors(replace(state.model, gleam=False))[0], errors(state.model)[0])
         state.trials.append(replace(trial, seconds=time.perf_counter() - start))
         state.lobed = trial.kept
     elif choosing and wanted:

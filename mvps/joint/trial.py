@@ -45,9 +45,8 @@ def held_out_errors(
     rotations: list[Tensor],
     law: Law,
     model: Model,
-) -> Float:
-    """(2 V,) mean absolute error of a vertex's held-out samples over their mean value, then of those deep in cast shadow; NaN where it has
-    none.
+) -> tuple[Float, Float]:
+    """(V,) mean absolute error of a vertex's held-out samples over their mean value, and (V,) of those deep in shadow; NaN without any.
 
     start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope. law: its
     lobes' kind; the model says the rest.
@@ -66,7 +65,7 @@ def held_out_errors(
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
     shadowed = [in_shadow(samples) for samples in kept]
-    return np.concatenate([_errors(kept, state, lights, law, False), _errors(shadowed, state, lights, law, True)])
+    return _errors(kept, state, lights, law, False), _errors(shadowed, state, lights, law, True)
 
 
 def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, in_shadow: bool) -> Float:
