@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvps.bounce import interpolation
-from mvps.camera import bilinear, pixel_footprint, project, view_directions
+from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
-from mvps.mesh import mean_edge_length, vertex_normals
+from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, ray_caster, shade_of, visible_vertices
 
@@ -40,8 +40,8 @@ LIGHTEST_PAIR = 1e-3
 """A pair of less weight (seen at over 88 degrees, or on a silhouette) is left out."""
 
 SHADOW_MARGIN = 2
-"""Pixels beside a cast shadow that are no data either, or edges of the mesh that are no shorter: a pixel mixes what is on both sides of the
-border, and the mesh says where that is to about another."""
+"""Pixels, or edges of the mesh, beside a cast shadow that are no data either: a pixel mixes what is on both sides of the border, and the
+mesh says where that is to about another."""
 
 HIDDEN_MARGIN = 1
 """Edges between what a view sees and what another part hides from it: their pixels mix both."""
@@ -156,8 +156,6 @@ def observe(
     """The samples of all views on the vertices of `surface`, or on those `among` (V,); visibility is traced anew, and cast shadows if
     the law has them."""
     caster = ray_caster(surface)
-    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
-    margin = int(np.ceil(SHADOW_MARGIN * pixel / mean_edge_length(surface)))
 
     def one(i: int) -> ViewSamples:
         view = capture.views[i]
@@ -166,7 +164,7 @@ def observe(
         image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
         dark = None
         if shadows:
-            shade = shade_of(caster, vertex, lights.direction[i], margin)
+            shade = shade_of(caster, vertex, lights.direction[i], SHADOW_MARGIN)
             usable, dark = usable & ~shade.beside, torch.from_numpy(usable & shade.deep).to(device)
         of_pairs = (vertex, towards.astype(np.float32), pair.astype(np.float32), image, usable)
         vertex_, towards_, pair_, image_, usable_ = (torch.from_numpy(values).to(device) for values in of_pairs)
