@@ -70,7 +70,7 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     """The model that the object needs, starting from Lambert's, and the account of the trials.
 
     largest: what may be tried, its lobes from wide to narrow; its neural residual comes later and is not. sharpen: solve the lobes'
-    sharpness, which takes longer than all else. held_out gives the errors (n,) of the vertices' held-out samples under a model, NaN where a
+    sharpness, which takes longer than all else. held_out gives the errors, as in `judged`, of held-out samples under a model, NaN where a
     vertex has none.
     """
     model = Model()
@@ -106,20 +106,23 @@ def gained(before: Float, after: Float) -> tuple[float, float]:
 
 
 def judged(name: str, before: Float, after: Float) -> Trial:
-    """The verdict on a component from the errors (n,) without and with it; its time is left at 0."""
-    gain, noise = gained(before, after)
-    return Trial(name, gain > CERTAIN * noise, gain, noise, 0.0)
+    """The verdict on a component from the errors (n,) without and with it, or from those of several kinds of samples (kinds, n): one must
+    gain, none lose. The account is that of the surest; its time is left at 0."""
+    of_kinds = [gained(b, a) for b, a in zip(np.atleast_2d(before), np.atleast_2d(after), strict=True)]
+    kept = any(gain > CERTAIN * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
+    gain, noise = max(of_kinds, key=lambda of_kind: of_kind[0] - CERTAIN * of_kind[1])
+    return Trial(name, kept, gain, noise, 0.0)
 
 
 def sharpened(model: Model, errors: Float, held_out: Callable[[Model], Float]) -> Model:
-    """The model with the sharpness of its lobes that predicts best; errors (n,): of the model as it is."""
+    """The model with the sharpness of its lobes that predicts the first kind of samples best; errors: of the model as it is."""
     at_first = np.array(model.sharpness)
 
     def by(change: Float) -> Model:
         return replace(model, sharpness=tuple((at_first * np.exp(change)).tolist()))
 
     def loss(change: Float) -> float:
-        return -gained(errors, held_out(by(change)))[0]
+        return -gained(np.atleast_2d(errors)[0], np.atleast_2d(held_out(by(change)))[0])[0]
 
     reach = np.full(len(at_first), np.log(SHARPENED))
     best, _ = minimise(loss, 0 * reach, -reach, reach, SHARPENING_STEP, SHARPENING_TOLERANCE, MOST_SHARPENED)

@@ -15,7 +15,7 @@ from mvps.joint.observe import observe
 from mvps.joint.photometry import grey_lights
 from mvps.joint.steps import free_reflectance
 from mvps.joint.trial import held_out_errors
-from mvps.material import SHARPENED, Model, choose
+from mvps.material import SHARPENED, Model, choose, judged
 from mvps.scene import Law
 
 CPU = torch.device("cpu")
@@ -35,6 +35,16 @@ def test_a_component_that_helps_stays_and_one_that_does_not_goes() -> None:
     assert model == Model((30.0,))
     assert [trial.kept for trial in trials] == [False, True, False, False, False]
     assert trials[1].gain == pytest.approx(-np.log(0.8), abs=0.02) and trials[1].noise < 0.02
+
+
+def test_one_kind_of_samples_must_gain_and_none_lose() -> None:
+    rng = np.random.default_rng(0)
+    before, scatter = np.ones((2, 400)), np.exp(rng.normal(0, 0.3, (2, 400)))
+    for factors, kept in (((0.8, 1.0), True), ((1.0, 0.8), True), ((1.0, 1.0), False), ((0.5, 1.2), False), ((1.2, 0.5), False)):
+        assert judged("", before, np.array(factors)[:, None] * scatter).kept == kept
+    # Few samples of great scatter do not hide what the others tell.
+    unsure = np.where(np.arange(400) < 30, np.exp(rng.normal(0, 2.0, 400)), np.nan)
+    assert judged("", before, np.stack([0.9 * scatter[0], unsure])).kept
 
 
 def test_vertices_without_held_out_samples_do_not_count() -> None:

@@ -138,4 +138,4 @@ def test_inter_reflection_is_kept_where_shadows_hold_light(seen: Seen) -> None:
     errors = [held_out_errors(few, part, seen.grey, tie, patches, rotations, DIFFUSE, Model(bounce=bounce)) for bounce in (False, True)]
     (_, dark), (_, told) = errors
     assert np.nanmedian(dark) == 1 and np.nanmedian(told) < 0.1
-    assert judged("inter-reflection", *(np.concatenate(of_both) for of_both in errors)).kept
+    assert judged("inter-reflection", *(np.stack(of_both) for of_both in errors)).kept

@@ -139,7 +139,7 @@ def _of_chosen_model(
     state.lobed = False
     lit = _lit(state, few, capture, state.lights, _senders(state, start))
     errors = _errors(state, capture, lit, start, tie, patches)
-    kept, state.trials = choose(state.model, lambda model: np.concatenate(errors(model)), sharpen)
+    kept, state.trials = choose(state.model, lambda model: np.stack(errors(model)), sharpen)
     state.model = replace(kept, gleam=state.model.gleam)
     state.law = replace(law, sharpness=kept.sharpness, grazing=law.grazing * kept.grazing, bounce=law.bounce * kept.bounce)
     stay = [k for k, trial in enumerate(state.trials[: len(law.sharpness)]) if trial.kept]
