@@ -110,7 +110,9 @@ def judged(name: str, before: Float, after: Float) -> Trial:
     gain, none lose. The account is that of the surest; its time is left at 0."""
     of_kinds = [gained(b, a) for b, a in zip(np.atleast_2d(before), np.atleast_2d(after), strict=True)]
     kept = any(gain > CERTAIN * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
-    gain, noise = max(of_kinds, key=lambda of_kind: of_kind[0] - CERTAIN * of_kind[1])
+    # A kind that no vertex has, or that does not change, has no account.
+    told = [of_kind for of_kind in of_kinds if any(of_kind)] or of_kinds
+    gain, noise = max(told, key=lambda of_kind: of_kind[0] - CERTAIN * of_kind[1])
     return Trial(name, kept, gain, noise, 0.0)
 
 
