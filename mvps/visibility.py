@@ -160,7 +160,7 @@ class Shade(NamedTuple):
 
 
 def shade_of(caster: RayCaster, vertices: Int, lights: Float, margin: int) -> Shade:
-    """Cast shadows of vertices (n,), indices, with what is within `margin` edges of them."""
+    """Cast shadows of vertices (n,), indices, with what is within `margin` edges of them, one at least."""
     around = caster.around[vertices]
     for _ in range(margin - 1):
         around = around @ caster.around

@@ -65,16 +65,16 @@ def held_out_errors(
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
     shadowed = [in_shadow(samples) for samples in kept]
-    return _errors(kept, state, lights, law, False), _errors(shadowed, state, lights, law, True)
+    return _errors(kept, state, lights, law, True), _errors(shadowed, state, lights, law, False)
 
 
-def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, in_shadow: bool) -> Float:
-    """(V,) mean absolute error over the samples' mean value, NaN for a vertex without any; in_shadow: nothing but what surfaces send."""
+def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, lit: bool) -> Float:
+    """(V,) mean absolute error over the samples' mean value, NaN for a vertex without any; not lit: they hold what surfaces send alone."""
     error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)
     for batch in batches(views, lights):
         index = batch.vertex
         shaded = evaluate(state.normal[index], state.reflectance[index], batch.towards, batch.lights, law, batch.gathered)
-        predicted = shaded.rest if in_shadow else shaded.predicted
+        predicted = shaded.predicted if lit else shaded.rest
         batch.added(error, (batch.weight * (predicted - batch.image).abs()).sum(-1))
         batch.added(level, (batch.weight * batch.image).sum(-1))
     ratio = (error / level).double().cpu().numpy()
