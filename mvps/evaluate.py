@@ -131,8 +131,8 @@ def _block(errors: Mapping[str, float], protocol: str) -> str:
 
 def read_views(path: Path, reconstruction: Reconstruction, truth: Truth) -> Capture:
     """All views of the capture with the photographs that were held out, and one more each where none was: the rest is not needed."""
-    from mvps.load import read_capture
     from mvps.measures import held_out_photographs
+    from mvps.same_object import capture_of
     from mvps.scene import CaptureError
 
     if not set(truth.views) & set(reconstruction.views):
@@ -145,7 +145,7 @@ def read_views(path: Path, reconstruction: Reconstruction, truth: Truth) -> Capt
         if view in numbers:
             numbers[view].append(number)
     first = {view: used[0] for view, used in zip(reconstruction.views, reconstruction.light_names, strict=True) if used}
-    return read_capture(path, lights={view: kept or [first.get(view, 1)] for view, kept in numbers.items()})
+    return capture_of(reconstruction, path, lights={view: kept or [first.get(view, 1)] for view, kept in numbers.items()})
 
 
 def write_json(path: Path, value: object) -> None:

@@ -6,7 +6,8 @@ With e_v the mean absolute error of vertex v's held-out samples over their mean 
     gain = mean(log e_before - log e_after),      noise = sd(log e_before - log e_after) / sqrt(n)
 
 and a component stays where gain > CERTAIN * noise: vertices are compared with themselves, which takes their differences out of the noise,
-and by ratios, because errors have long tails.
+and by ratios, because errors have long tails. Where there are errors of several kinds (of samples in the light, of samples in shadow), one
+must gain by that, and none lose by as much.
 """
 
 from __future__ import annotations

@@ -19,11 +19,12 @@ from mvps.export import read_reconstruction
 from mvps.folders import appearing_whole
 from mvps.illumination import Illumination, environment_lights
 from mvps.layers import Layer, rendered
-from mvps.load import read_capture, read_environment
+from mvps.load import read_environment
 from mvps.mesh import lengths, normalise
 from mvps.pbr import srgb_bytes, white_level
 from mvps.progress import Progress
 from mvps.rendering import light_senders
+from mvps.same_object import capture_of
 from mvps.scene import Camera, CaptureError, Float, Reconstruction
 from mvps.texture import png_bytes
 from mvps.viewpoints import ball_around, look_at, read_cameras, turntable
@@ -44,7 +45,7 @@ def write_pictures(given: Namespace) -> None:
     cameras = chosen_cameras(given, result)
     material = result.material
     if "edit" in given:
-        seen_from = {v.name: v.camera for v in read_capture(given.capture, lights=[1]).views} if "capture" in given else cameras
+        seen_from = {v.name: v.camera for v in capture_of(result, given.capture, lights=[1]).views} if "capture" in given else cameras
         material = edited(result.surface, material, read_edits(given.edit), seen_from)
     environment = None
     if "envmap" in given:
@@ -82,7 +83,7 @@ def chosen_cameras(given: Namespace, result: Reconstruction) -> dict[str, Camera
         target = np.array(given.target) if "target" in given else centre
         return {"camera": look_at(np.array(given.camera), target, np.array(given.up), width, height, given.fov)}
     if "capture" in given and "turntable" not in given:
-        views = read_capture(given.capture, views=given.views if "views" in given else None, lights=[1]).views
+        views = capture_of(result, given.capture, given.views if "views" in given else None, [1]).views
         return {view.name: view.camera for view in views}
     frames = given.turntable if "turntable" in given else 1
     if not 1 <= frames <= 9999:

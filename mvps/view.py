@@ -200,10 +200,11 @@ def main(argv: Sequence[str]) -> None:
 
     from mvps.edits import edited, read_edits
     from mvps.export import read_reconstruction
-    from mvps.load import read_capture, read_environment
+    from mvps.load import read_environment
+    from mvps.same_object import capture_of
 
     result = read_reconstruction(given.result)
-    capture = read_capture(given.capture) if "capture" in given else None
+    capture = capture_of(result, given.capture) if "capture" in given else None
     if "edit" in given:
         cameras = {} if capture is None else {view.name: view.camera for view in capture.views}
         result = replace(result, material=edited(result.surface, result.material, read_edits(given.edit), cameras))
