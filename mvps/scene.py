@@ -215,9 +215,10 @@ confidence = 1 / (1 + (sigma / RELIABLE)^2) with sigma the standard deviation al
 
 
 def expected_error_deg(confidence: Float) -> Float:
-    """Mean error, degrees, of normals with this confidence (n,) above 0: sqrt(pi / 2) times the standard deviation along a tangent."""
-    error: Float = np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(np.maximum(1 / confidence - 1, 0)))
-    return error
+    """Mean error, degrees, of normals with this confidence (n,): sqrt(pi / 2) times the standard deviation along a tangent, 90 at
+    most: more is no error of a direction that a camera sees."""
+    error: Float = np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(1 / np.clip(confidence, 1e-12, 1.0) - 1))
+    return error.clip(max=90.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,7 +93,7 @@ def median(values: Float, area: Float) -> float:
 def expected_deg(material: Material, area: Float) -> float:
     """Mean expected error of normals where vertices of this area (V,) are seen, degrees, none over 90; 90 where none is seen."""
     seen = (material.confidence > 0) & (area > 0)
-    return float(np.average(np.minimum(expected_error_deg(material.confidence[seen]), 90), weights=area[seen])) if seen.any() else 90.0
+    return float(np.average(expected_error_deg(material.confidence[seen]), weights=area[seen])) if seen.any() else 90.0
 
 
 def _silhouette(caster: RayCaster, view: View, distance: NDArray[np.float32]) -> tuple[float, float]:
@@ -132,8 +132,7 @@ def depth_px(capture: Capture, surface: Surface, material: Material, seen: Seque
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
     radius = lengths(surface.vertices - surface.vertices.mean(0)).mean()
     away = neighbours(cKDTree(several), alone)[0] if len(several) else np.full(len(alone), radius)
-    # Confidence 0 knows nothing: the error's limit.
-    error = np.radians(np.minimum(expected_error_deg(np.maximum(material.confidence[views == 1], 1e-12)), 90))
+    error = np.radians(expected_error_deg(material.confidence[views == 1]))
     area = vertex_areas(surface)
     return float((error * away * area[views == 1]).sum() / pixel / max(area[views > 0].sum(), np.finfo(float).tiny))
 

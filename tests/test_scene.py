@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mvps.scene import Camera, Capture, Lights, Material, NormalMap, Reconstruction, Surface, Truth, View
+from mvps.scene import RELIABLE, Camera, Capture, Lights, Material, NormalMap, Reconstruction, Surface, Truth, View, expected_error_deg
 from mvps.values import checked
 
 K = np.array([[100.0, 0, 4], [0, 100, 3], [0, 0, 1]])
@@ -152,3 +152,12 @@ def test_photographs_that_are_no_data() -> None:
     assert part.views[0] is whole.views[0]
     assert part.views[1].usable().any(0).tolist() == [True, True, False, True]
     assert np.array_equal(part.views[1].samples[:, [0, 1, 3]], whole.views[1].samples[:, [0, 1, 3]])
+
+
+def test_expected_errors_are_between_none_and_a_right_angle() -> None:
+    """Rayleigh's mean, sqrt(pi / 2) sigma, where that is an angle; what nothing is known of is at most 90 degrees off."""
+    sigma = np.array([0.0, 0.01, 0.2])
+    certain = 1 / (1 + (sigma / RELIABLE) ** 2)
+    drawn = np.degrees(np.hypot(*np.random.default_rng(0).normal(size=(2, 200_000)))).mean()
+    np.testing.assert_allclose(expected_error_deg(certain), drawn * sigma, rtol=0.01)
+    assert expected_error_deg(np.array([1e-7, 0.0])).tolist() == [90, 90]
