@@ -17,7 +17,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.stated import icosahedron, stated_confidence
 from mvps.joint.steps import free_reflectance, vertex_steps
 from mvps.mesh import vertex_normals
-from mvps.scene import RELIABLE, Float, Law
+from mvps.scene import RELIABLE, Float, Law, Surface
 
 CPU = torch.device("cpu")
 LAMBERT = Law(())
@@ -109,3 +109,24 @@ def test_kinds_of_lights_are_spread_evenly() -> None:
     assert np.allclose(np.linalg.norm(corners, axis=1), 1)
     nearest = np.sort(corners @ corners.T, axis=1)
     assert np.allclose(nearest[:, -6:-1], 1 / np.sqrt(5)) and np.allclose(corners.sum(0), 0)
+
+
+def test_detail_at_the_edges_stands_for_detail_below_them(scene: SphereScene) -> None:
+    """Normals that change from each vertex to the next, of the photographs and of the surface alike, state about as much error; what noise
+    makes them differ by is not taken for detail."""
+    _, truth, lights = photographed(scene)
+    ball, draw = scene.reconstruction.surface, torch.Generator().manual_seed(0)
+    edge = np.linalg.norm(ball.vertices[ball.faces[:, 0]] - ball.vertices[ball.faces[:, 1]], axis=1).mean()
+    lumps = np.random.default_rng(0).normal(size=(len(ball.vertices), 1)) * 0.04 * edge
+    rough = Surface(ball.vertices * (1 + lumps / np.linalg.norm(ball.vertices, axis=1, keepdims=True)), ball.faces)
+    turned = replace(truth, normal=torch.tensor(vertex_normals(rough), dtype=torch.float32))
+    stated = []
+    for surface, vertices in ((ball, truth), (rough, turned)):
+        made = SphereScene(replace(scene.reconstruction, surface=surface), scene.capture)
+        views = photographed(made)[0]
+        noisy = [replace(samples, image=samples.image + 0.01 * independent(samples, draw)) for samples in views]
+        found = stated_deg(made, noisy, vertices, lights)
+        stated.append(np.sqrt((found[np.isfinite(found)] ** 2).mean()))
+    shown = np.degrees((turned.normal - truth.normal).norm(dim=1).numpy()) / np.sqrt(2)
+    assert 0.5 < stated[1] / np.sqrt((shown**2).mean()) < 2
+    assert stated[0] < 0.3 * stated[1]

@@ -8,11 +8,13 @@ covariance
     H^-1 (s^2 H + sum_views g_c g_c^T + sum_lights g_c g_c^T) H^-1
 
 (sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011). Lights nearest to the same of
-twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Last, no surface has the
+twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Then, no surface has the
 normals n of all vertices: fused positions keep only what is integrable of them, and of an error without any pattern half is. So how far n
-is from the normal m of the surface is one more sign of error. Of each tangential component
+is from the normal m of the surface is one more sign of error. Last, a surface goes on between its vertices: where it has detail, it has as
+much again below its edges as it shows at them. That is how far n is from the mean k of its d neighbours' normals, beyond what noise alone
+parts them by. Of each tangential component
 
-    sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2
+    sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2 + max(|n - k|^2 / 2 - (1 + 1 / d) sigma_noise^2, 0)
 
 where the tie to the mesh stands in where samples say little. A vertex has few clusters, so its figures are averaged with its neighbours'.
 No constant is fitted to true normals.
@@ -57,8 +59,19 @@ def stated_confidence(of: Observed, tie: float) -> Float:
     # A camera sees no two normals that are further apart than a radian or so.
     variance = torch.where(seen, variance.clamp(1e-12, 1.0), 0.0)
     away = of.vertices.normal - torch.tensor(vertex_normals(of.surface)).to(of.vertices.normal)
-    variance, apart = _averaged(torch.stack([variance, away.square().sum(1) / 2], 1), seen, of.surface).unbind(1)
-    return torch.where(seen, confidence_of((1 / (1 / variance + 1 / tie**2) + apart).sqrt()), 0.0).double().cpu().numpy()
+    noise = torch.where(seen, scale * (bread[:, 0, 0] + bread[:, 1, 1]) / 2, 0.0)
+    terms = torch.stack([variance, away.square().sum(1) / 2, _detail(of, seen, noise)], 1)
+    variance, apart, detail = _averaged(terms, seen, of.surface).unbind(1)
+    sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail.clamp_min(0)).sqrt()
+    return torch.where(seen, confidence_of(sigma), 0.0).double().cpu().numpy()
+
+
+def _detail(of: Observed, seen: Tensor, noise: Tensor) -> Tensor:
+    """(V,) |n - k|^2 / 2 without what noise with this variance (V,) along a tangent adds to it in the mean."""
+    total, count = _summed(of.vertices.normal, seen, of.surface)
+    count = count.clamp_min(1)
+    apart = (of.vertices.normal - total / count[:, None]).square().sum(1) / 2
+    return torch.where(total.square().sum(1) > 0, apart - (1 + 1 / count) * noise, 0.0)
 
 
 def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> tuple[Tensor, ...]:
@@ -87,12 +100,17 @@ def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[Directional
 
 def _averaged(values: Tensor, known: Tensor, surface: Surface) -> Tensor:
     """(V, k) values, where known, averaged with their neighbours'."""
-    ends = torch.from_numpy(edges(surface)).to(known.device)
-    share = known.to(values)[:, None]
     for _ in range(ROUNDS):
-        total = torch.cat([values, torch.ones_like(share)], 1) * share
-        around = total.clone()
-        for here, there in ((0, 1), (1, 0)):
-            around.index_add_(0, ends[:, here], total[ends[:, there]])
-        values = around[:, :-1] / around[:, -1:].clamp_min(1)
+        total, count = _summed(values, known, surface)
+        values = (total + values * known[:, None]) / (count + known.to(count))[:, None].clamp_min(1)
     return values
+
+
+def _summed(values: Tensor, known: Tensor, surface: Surface) -> tuple[Tensor, Tensor]:
+    """(V, k) sums of the values (V, k) of a vertex's known neighbours, and (V,) how many these are."""
+    ends = torch.from_numpy(edges(surface)).to(known.device)
+    own = torch.cat([values, torch.ones_like(values[:, :1])], 1) * known[:, None]
+    around = torch.zeros_like(own)
+    for here, there in ((0, 1), (1, 0)):
+        around.index_add_(0, ends[:, here], own[ends[:, there]])
+    return around[:, :-1], around[:, -1]

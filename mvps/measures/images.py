@@ -49,19 +49,21 @@ def photograph_errors(
     held-out views, the others as held-out lights. Photographs that the capture lacks are left out. One scale serves all of
     them and is reported as photograph_scale: intensities are relative, so it need not be 1.
     """
-    pairs: list[tuple[View, Any, Any, Any]] = [
-        (view, image, view.radiance(kept), view.usable(kept)) for view, kept, image in rendered(surface, material, lights, capture)
-    ]
-    if not pairs:
+    renderings = list(rendered(surface, material, lights, capture))
+    if not renderings:
         return {}
-    # Clipped samples say nothing about the scale.
-    products = [(float(r[u].ravel() @ p[u].ravel()), float(r[u].ravel() @ r[u].ravel())) for _, r, p, u in pairs]
-    scale = sum(a for a, _ in products) / max(sum(b for _, b in products), np.finfo(float).tiny)
+    products = np.zeros(2)
+    for view, kept, image in renderings:
+        # Clipped samples say nothing about the scale.
+        usable = view.usable(kept)
+        seen = image[usable].ravel()
+        products += seen @ view.radiance(kept)[usable].ravel(), seen @ seen
+    scale = float(products[0] / max(products[1], np.finfo(float).tiny))
     psnr: dict[str, list[float]] = {"held_out_views_psnr_db": [], "held_out_lights_psnr_db": []}
-    for view, image, photographed, _ in pairs:
+    for view, kept, image in renderings:
         # Below the variance of rounding to a code value nothing can be told apart.
         peak = view.scale * view.saturation
-        mean_square = ((np.minimum(scale * image, peak) - np.minimum(photographed, peak)) ** 2).mean((0, 2), dtype=np.float64)
+        mean_square = ((np.minimum(scale * image, peak) - np.minimum(view.radiance(kept), peak)) ** 2).mean((0, 2), dtype=np.float64)
         group = "held_out_views_psnr_db" if view.name in held_out_views else "held_out_lights_psnr_db"
         psnr[group] += (10 * np.log10(peak**2 / np.maximum(mean_square, view.scale**2 / 12))).tolist()
     return {name: float(np.mean(values)) for name, values in psnr.items() if values} | {"photograph_scale": scale}
