@@ -9,7 +9,8 @@ has radiance rho E. So
 
 An environment is a picture of all directions, rows of equal elevation (first row: straight up), columns of equal azimuth. Its lights are
 regions of about equal energy, each a directional light with the region's colour and mean direction (median cut: Debevec 2005): importance
-sampling without noise, which keeps the sum of E exactly.
+sampling without noise, which keeps the sum of E exactly. Lobes are made duller by the variance of a region's directions, along its longer
+side (shading.lobes): else a polished body would show the lights one by one.
 """
 
 from __future__ import annotations
@@ -32,16 +33,22 @@ NONE: Float = np.zeros((0, 3))
 @dataclass(frozen=True, eq=False)
 class Illumination:
     """direction, intensity (lights, 3): directional lights, unit, from the surface towards the light; position, strength (points, 3):
-    points of light in world units and their J."""
+    points of light in world units and their J. spread (lights,): variance of the directions that a directional light stands for,
+    along the tangent where it is largest, radians^2; 0 where it is not given."""
 
     direction: Float = field(default_factory=NONE.copy)
     intensity: Float = field(default_factory=NONE.copy)
     position: Float = field(default_factory=NONE.copy)
     strength: Float = field(default_factory=NONE.copy)
+    spread: Float = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.spread):
+            object.__setattr__(self, "spread", np.zeros(len(self.direction)))
 
     def with_also(self, other: Illumination) -> Illumination:
         """Both together."""
-        names = ("direction", "intensity", "position", "strength")
+        names = ("direction", "intensity", "position", "strength", "spread")
         return Illumination(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
 
@@ -85,8 +92,12 @@ def environment_lights(picture: NDArray[np.float32], count: int, up: Float, azim
         single += [] if halves else [region]
     regions = [*single, *(region for _, region in heap)]
     lights = [(direction[a:b, c:d], arriving[a:b, c:d], energy[a:b, c:d]) for a, b, c, d in regions if energy[a:b, c:d].sum() > 0]
-    towards = [normalise((vectors * power[..., None]).sum((0, 1))) for vectors, _, power in lights]
-    return Illumination(np.array(towards).reshape(-1, 3), np.array([colour.sum((0, 1)) for _, colour, _ in lights]).reshape(-1, 3))
+    share = [(vectors, power / power.sum()) for vectors, _, power in lights]
+    mean = np.array([np.einsum("hwi,hw->i", vectors, part) for vectors, part in share]).reshape(-1, 3)
+    square = np.array([np.einsum("hwi,hwj,hw->ij", vectors, vectors, part) for vectors, part in share]).reshape(-1, 3, 3)
+    spread = np.linalg.eigvalsh(square - mean[:, :, None] * mean[:, None])[:, -1]
+    intensity = np.array([colour.sum((0, 1)) for _, colour, _ in lights]).reshape(-1, 3)
+    return Illumination(normalise(mean), intensity, spread=np.maximum(spread, 0))
 
 
 def _energy(sums: Float, top: int, bottom: int, left: int, right: int) -> float:

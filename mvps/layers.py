@@ -68,7 +68,8 @@ def _share(light: Illumination, k: int) -> Illumination:
     """The k-th ray's part of the lights."""
     if len(light.direction) < MANY_LIGHTS:
         return light
-    return Illumination(light.direction[k::SUBPIXELS], SUBPIXELS * light.intensity[k::SUBPIXELS], light.position, light.strength)
+    some = slice(k, None, SUBPIXELS)
+    return Illumination(light.direction[some], SUBPIXELS * light.intensity[some], light.position, light.strength, light.spread[some])
 
 
 def _of_pixels(
@@ -100,10 +101,10 @@ def _lit(
     hidden, arriving = np.zeros(len(view)), np.zeros(len(view))
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(view)))
     for start in range(0, len(light.direction), step):
-        direction, intensity = light.direction[start : start + step], light.intensity[start : start + step]
+        direction, intensity, wide = (a[start : start + step] for a in (light.direction, light.intensity, light.spread))
         shadow = shadow_at(caster, material.law, points, direction)
-        image += np.einsum("nlc,nl,lc->nc", shaded(points, view, material, direction), ~shadow, intensity)
-        lobes = specular_shading(points.normal, view, direction, points.specular_weight, material.law)
+        image += np.einsum("nlc,nl,lc->nc", shaded(points, view, material, direction, wide), ~shadow, intensity)
+        lobes = specular_shading(points.normal, view, direction, points.specular_weight, material.law, wide)
         specular += np.einsum("nlc,nl,lc->nc", np.broadcast_to(lobes, (*shadow.shape, 3)), ~shadow, intensity)
         flux = np.maximum(points.normal @ direction.T, 0) * intensity.mean(1)
         hidden, arriving = hidden + (flux * shadow).sum(1), arriving + flux.sum(1)

@@ -109,21 +109,28 @@ def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: fl
     return shaded
 
 
-def specular_shading(normal: Float, towards: Float, direction: Float, weight: Float, law: Law) -> NDArray[np.float32]:
-    """(n, lights, 1 or 3) radiance over intensity of the lobes with weights (n, lobes[, 3]); else as `diffuse_shading`."""
+def specular_shading(
+    normal: Float, towards: Float, direction: Float, weight: Float, law: Law, spread: Float | None = None
+) -> NDArray[np.float32]:
+    """(n, lights, 1 or 3) radiance over intensity of the lobes with weights (n, lobes[, 3]); spread (lights,) as in `shading.lobes`, the
+    others as in `diffuse_shading`."""
     n, v, light = (torch.tensor(a, dtype=torch.float32) for a in (normal, towards, direction))
     of_channels = torch.tensor(weight if weight.ndim == 3 else weight[..., None], dtype=torch.float32)
     black = torch.zeros(len(n), 1)
-    shaded: NDArray[np.float32] = shade(n, v, light, black, of_channels, law).numpy()
+    shaded: NDArray[np.float32] = shade(n, v, light, black, of_channels, law, _spread(spread)).numpy()
     return shaded
 
 
-def shaded(points: Points, view: Float, material: Material, direction: Float) -> NDArray[np.float32]:
+def _spread(values: Float | None) -> torch.Tensor | None:
+    return None if values is None else torch.tensor(values, dtype=torch.float32)
+
+
+def shaded(points: Points, view: Float, material: Material, direction: Float, spread: Float | None = None) -> NDArray[np.float32]:
     """Radiance over intensity (n, lights, 3) at points seen along view (n, 3) under lights direction (lights, 3), or (n, lights, 3) where
-    every point has its own; attached shadows included, cast ones and inter-reflection not."""
+    every point has its own; attached shadows included, cast ones and inter-reflection not. spread (lights,) as in `shading.lobes`."""
     arrays = (points.normal, view, direction, points.albedo, points.specular_weight)
     normal, towards, light, albedo, weight = (torch.tensor(a, dtype=torch.float32) for a in arrays)
-    image: NDArray[np.float32] = shade(normal, towards, light, albedo, weight, material.law).numpy()
+    image: NDArray[np.float32] = shade(normal, towards, light, albedo, weight, material.law, _spread(spread)).numpy()
     if material.residual is not None:
         image *= factor(material.residual, points.share, points.code, points.normal, view, direction)[..., None]
     return image

@@ -77,9 +77,17 @@ def lobe(h_dot_n: Tensor, sharpness: float | Tensor, microfacet: bool) -> tuple[
     return spread**-2, sharpness * h_dot_n / spread
 
 
-def lobes(h_dot_n: Tensor, law: Law) -> Tensor:
-    """(..., lobes) values of the law's lobes for h . n (...)."""
-    values = [lobe(h_dot_n, s, law.microfacet)[0] for s in law.sharpness]
+def lobes(h_dot_n: Tensor, law: Law, spread: Tensor | None = None) -> Tensor:
+    """(..., lobes) values of the law's lobes for h . n (...).
+
+    spread (lights,): variance of the directions that a light stands for, radians^2 (illumination.py). Half vectors turn half as far, so a
+    lobe is s / (1 + s spread / 4) sharp, and of as much less height that it returns the same (as in Toksvig 2005).
+    """
+    if spread is None:
+        values = [lobe(h_dot_n, s, law.microfacet)[0] for s in law.sharpness]
+    else:
+        duller = [1 / (1 + s * spread / 4) for s in law.sharpness]
+        values = [lobe(h_dot_n, s * d, law.microfacet)[0] * d for s, d in zip(law.sharpness, duller, strict=True)]
     return torch.stack(values, -1) if values else h_dot_n.new_zeros(*h_dot_n.shape, 0)
 
 
@@ -115,11 +123,13 @@ def against(vectors: Tensor, light: Tensor) -> Tensor:
     return vectors @ light.T if light.ndim == 2 else (light @ vectors[..., None])[..., 0]
 
 
-def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_weight: Tensor, law: Law) -> Tensor:
+def shade(
+    normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_weight: Tensor, law: Law, spread: Tensor | None = None
+) -> Tensor:
     """Radiance over intensity (points, lights, 3), attached shadow included, cast shadow not.
 
     normal, view (points, 3) unit; light (lights, 3) unit, or (points, lights, 3) where every point has its own; albedo (points, 3);
-    specular_weight (points, lobes) or (points, lobes, 3). All in one frame.
+    specular_weight (points, lobes) or (points, lobes, 3). All in one frame. spread (lights,): of lights that stand for many (`lobes`).
     """
     n_dot_l = against(normal, light)
     n_dot_v = (normal * view).sum(-1, keepdim=True)
@@ -127,5 +137,5 @@ def shade(normal: Tensor, view: Tensor, light: Tensor, albedo: Tensor, specular_
     h_dot_n = half_dot_normal(n_dot_v, n_dot_l, v_dot_l)
     D_l, D_v = (1 + law.grazing * (1 - x.clamp_min(0)) ** GRAZING_POWER for x in (n_dot_l, n_dot_v))
     weight = specular_weight if specular_weight.ndim == 3 else specular_weight[..., None].expand(-1, -1, 3)
-    specular = gain(half_length(v_dot_l))[..., None] * (lobes(h_dot_n, law) @ weight)
+    specular = gain(half_length(v_dot_l))[..., None] * (lobes(h_dot_n, law, spread) @ weight)
     return (albedo[:, None] * (D_l * D_v)[..., None] + specular) * n_dot_l.clamp_min(0)[..., None]

@@ -118,8 +118,9 @@ class Model:
         return shadows(self._caster, self._result.surface.vertices, self._caster.vertex_normals, lights)
 
     def environment(self, query: str) -> Answer:
-        """Of ?of=studio&turn=30 the lights that stand for the environment, turned by so many degrees: float32 (lights, 6) direction and
-        colour; then uint32 (V,), of each vertex the bits of the lights that reach it. CaptureError where there is no such environment."""
+        """Of ?of=studio&turn=30 the lights that stand for the environment, turned by so many degrees: float32 (lights, 7) direction, colour
+        and spread (illumination.py); then uint32 (V,), of each vertex the bits of the lights that reach it. CaptureError where there is no
+        such environment."""
         import numpy as np
 
         from mvps.illumination import environment_lights
@@ -129,7 +130,7 @@ class Model:
         if name not in self._environments or not turn.removeprefix("-").isdecimal():
             raise CaptureError(f"of: wanted one of {', '.join(self._environments)} and a turn in whole degrees, given {query!r}")
         light = environment_lights(self._environments[name], ENVIRONMENT_LIGHTS, self._up, int(turn) % 360)
-        lights = np.concatenate([light.direction, light.intensity], 1).astype("<f4")
+        lights = np.column_stack([light.direction, light.intensity, light.spread]).astype("<f4")
         reached = ~self._hidden(light.direction) @ (1 << np.arange(len(lights), dtype=np.uint32))
         return "application/octet-stream", lights.tobytes() + reached.astype("<u4").tobytes()
 

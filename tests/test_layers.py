@@ -46,6 +46,29 @@ def test_a_uniform_environment_shows_white_as_its_radiance(scene: SphereScene, c
     assert found["shadow"][inner(coverage)].max() < 0.05 and (found["image"][coverage == 0] == 0).all()
 
 
+@pytest.mark.parametrize("microfacet", [False, True])
+def test_a_polished_body_shows_an_environment_and_not_its_lights(scene: SphereScene, caster: RayCaster, microfacet: bool) -> None:
+    """256 lights, each as wide as its region, are nearer to sixteen times as many than 256 without a width, which are dots."""
+    outward = scene.reconstruction.surface.vertices / RADIUS
+    weight = np.full((len(outward), 1), 1.0)
+    polished = replace(
+        scene.reconstruction.material,
+        normal=outward,
+        albedo=np.zeros_like(outward),
+        specular_weight=weight,
+        sharpness=np.array([1000.0]),
+        microfacet=microfacet,
+    )
+    bright = np.linspace(2, 0.5, 64)[:, None, None] * np.ones((64, 128, 3))
+    few, many = (environment_lights(bright.astype(np.float32), count, np.array([0.0, 0.0, 1.0])) for count in (256, 4096))
+    dots = replace(few, spread=np.zeros(len(few.direction)))
+    wanted, wide, narrow = (rendered(caster, polished, CAMERA, light, ("specular",))[0]["specular"][..., 0] for light in (many, few, dots))
+    middle = np.s_[16:32, 16:32]
+    assert few.spread.min() > 0
+    off, off_dots = (np.abs(found - wanted)[middle].mean() / wanted[middle].mean() for found in (wide, narrow))
+    assert off < 0.5 * off_dots
+
+
 def test_pixels_are_the_mean_of_their_rays(scene: SphereScene, caster: RayCaster) -> None:
     material = scene.reconstruction.material
     found, coverage = rendered(caster, material, CAMERA, SUN, ("image",))

@@ -99,9 +99,9 @@ def test_the_server_traces_environments(address: str, scene: SphereScene) -> Non
 
     def asked(words: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         answer = urlopen(f"{address}/environment?of={words}").read()
-        numbers = np.frombuffer(answer[: -4 * len(surface.vertices)], "<f4").reshape(-1, 6)
+        numbers = np.frombuffer(answer[: -4 * len(surface.vertices)], "<f4").reshape(-1, 7)
         bits = np.frombuffer(answer[-4 * len(surface.vertices) :], "<u4")
-        return numbers[:, :3], numbers[:, 3:], (bits[:, None] >> np.arange(len(numbers))) & 1
+        return numbers[:, :3], numbers[:, 3:6], (bits[:, None] >> np.arange(len(numbers))) & 1
 
     direction, colour, reached = asked("white.hdr")
     arriving = (np.maximum(scene.reconstruction.material.normal @ direction.T, 0) * reached) @ colour

@@ -56,23 +56,25 @@
   const MODEL = `
     uniform vec3 tint[4]; uniform vec4 sharpness, lobeWhite; uniform float white, grazing; uniform int layer; uniform bool microfacet;
     float D(float c) { float g = 1.0 - max(c, 0.0); return 1.0 + grazing * g * g * g; }
-    vec3 shine(vec4 w, vec3 N, vec3 v, vec3 l) {
+    vec3 shine(vec4 w, vec3 N, vec3 v, vec3 l, float wide) {
       float hn = dot(normalize(v + l), N);
       vec3 sum = vec3(0.0);
       for (int k = 0; k < 4; k++) {
-        float s = sharpness[k], lobe = exp(s * (hn - 1.0)), spread = 1.0 + s / 4.0 * (1.0 - hn * hn);
-        sum += w[k] * w[k] * lobeWhite[k] * tint[k] * (microfacet ? 1.0 / (spread * spread) : lobe);
+        float duller = 1.0 / (1.0 + sharpness[k] * wide / 4.0), s = sharpness[k] * duller;
+        float lobe = exp(s * (hn - 1.0)), spread = 1.0 + s / 4.0 * (1.0 - hn * hn);
+        sum += w[k] * w[k] * lobeWhite[k] * tint[k] * duller * (microfacet ? 1.0 / (spread * spread) : lobe);
       }
       return sum * min(2.0 / max(1.0 + dot(v, l), 1e-6), 4.0);
     }
-    vec3 lit(vec3 body, vec4 w, vec3 N, vec3 v, vec3 l) {
+    // wide: variance of the directions that a light stands for, as in mvps/shading.py.
+    vec3 lit(vec3 body, vec4 w, vec3 N, vec3 v, vec3 l, float wide) {
       vec3 matte = layer == 2 ? vec3(0.0) : body * D(dot(N, l)) * D(dot(N, v));
-      return (matte + shine(w, N, v, l)) * max(dot(N, l), 0.0);
+      return (matte + shine(w, N, v, l, wide)) * max(dot(N, l), 0.0);
     }`;
   const VERTEX = `#version 300 es
     precision highp float; precision highp int;
     in vec3 position; in vec3 normal; in vec3 albedo; in vec4 weight; in float confidence; in vec4 reached; in uint open;
-    uniform vec3 low, high, eye, sky[${SKY}], skyColour[${SKY}]; uniform mat4 view; uniform int around;
+    uniform vec3 low, high, eye, sky[${SKY}], skyColour[${SKY}]; uniform float skyWide[${SKY}]; uniform mat4 view; uniform int around;
     out vec3 x, n, rho, surrounding; out vec4 w, seen; out float certain;
     ${MODEL}
     void main() {
@@ -80,7 +82,7 @@
       surrounding = vec3(0.0);
       vec3 N = normalize(n), v = normalize(eye - x);
       for (int k = 0; k < around; k++)
-        if (((open >> uint(k)) & 1u) == 1u) surrounding += skyColour[k] * lit(rho * rho * white, w, N, v, sky[k]);
+        if (((open >> uint(k)) & 1u) == 1u) surrounding += skyColour[k] * lit(rho * rho * white, w, N, v, sky[k], skyWide[k]);
       gl_Position = view * vec4(x, 1.0);
     }`;
   const FRAGMENT = `#version 300 es
@@ -113,8 +115,8 @@
         colour = vec4(vec3(free / float(lights)), 1.0);
         return;
       }
-      vec3 shown = surrounding + fill * lit(body, w, N, v, v);
-      for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, N, v, light[k]) * visibility(k);
+      vec3 shown = surrounding + fill * lit(body, w, N, v, v, 0.0);
+      for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, N, v, light[k], 0.0) * visibility(k);
       colour = vec4(srgb(shown * exposure), 1.0);
     }`;
   const DEPTH = `#version 300 es
@@ -223,7 +225,8 @@
     set(shown, "around", "1i", sky.length);
     if (sky.length) {
       set(shown, "sky", "3fv", sky.flatMap((light) => light.slice(0, 3)));
-      set(shown, "skyColour", "3fv", sky.flatMap((light) => light.slice(3)));
+      set(shown, "skyColour", "3fv", sky.flatMap((light) => light.slice(3, 6)));
+      set(shown, "skyWide", "1fv", sky.map((light) => light[6]));
     }
     set(shown, "tint", "3fv", about.tint.flat());
     set(shown, "sharpness", "4fv", about.sharpness);
@@ -283,7 +286,7 @@
     if (name) {
       const answer = await bytesOf("environment?of=" + encodeURIComponent(name) + "&turn=" + turn);
       const numbers = new Float32Array(answer.slice(0, answer.byteLength - 4 * V));
-      found = Array.from({ length: numbers.length / 6 }, (_, k) => Array.from(numbers.slice(6 * k, 6 * k + 6)));
+      found = Array.from({ length: numbers.length / 7 }, (_, k) => Array.from(numbers.slice(7 * k, 7 * k + 7)));
       bits = new Uint32Array(answer.slice(answer.byteLength - 4 * V));
     }
     // A later choice may have been answered first.
