@@ -1,6 +1,6 @@
 """How far off a vertex's normal may be: the error that is stated with it.
 
-Three things are wrong with a normal. Noise is independent from sample to sample. What the model does not know (other lobes,
+Four things are wrong with a normal. Noise is independent from sample to sample. What the model does not know (other lobes,
 inter-reflection, a position that is off) is shared by the samples of one view, or by those under one light. With H the vertex's normal
 equations, s its residuals' scale and g_c the part of the gradient that comes from view or light c, the errors of the unknowns have the
 covariance
@@ -10,11 +10,12 @@ covariance
 (sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011). Lights nearest to the same of
 twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Then, no surface has the
 normals n of all vertices: fused positions keep only what is integrable of them, and of an error without any pattern half is. So how far n
-is from the normal m of the surface is one more sign of error. Last, a surface goes on between its vertices: where it has detail, it has as
-much again below its edges as it shows at them. That is how far n is from the mean k of its d neighbours' normals, beyond what noise alone
-parts them by. Of each tangential component
+is from the normal m of the surface is one more sign of error. Last, a surface goes on between its vertices. The mean M over neighbours
+takes apart what normals show at the length of an edge, D = |n - M n|^2 / 2, and at twice that, C = |M n - M^4 n|^2 / 2, both beyond what
+noise alone does. Below the edges there is as much less again, by D / C: by 1, which is most, where all scales are as rough, by 1/9 where
+the surface is smooth. Of each tangential component
 
-    sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2 + max(|n - k|^2 / 2 - (1 + 1 / d) sigma_noise^2, 0)
+    sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2 + D min(D / C, 1)
 
 where the tie to the mesh stands in where samples say little. A vertex has few clusters, so its figures are averaged with its neighbours'.
 No constant is fitted to true normals.
@@ -60,18 +61,24 @@ def stated_confidence(of: Observed, tie: float) -> Float:
     variance = torch.where(seen, variance.clamp(1e-12, 1.0), 0.0)
     away = of.vertices.normal - torch.tensor(vertex_normals(of.surface)).to(of.vertices.normal)
     noise = torch.where(seen, scale * (bread[:, 0, 0] + bread[:, 1, 1]) / 2, 0.0)
-    terms = torch.stack([variance, away.square().sum(1) / 2, _detail(of, seen, noise)], 1)
-    variance, apart, detail = _averaged(terms, seen, of.surface).unbind(1)
-    sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail.clamp_min(0)).sqrt()
+    terms = torch.stack([variance, away.square().sum(1) / 2, *_bands(of, seen, noise)], 1)
+    variance, apart, edge, coarse = _averaged(terms, seen, of.surface).unbind(1)
+    edge = edge.clamp_min(0)
+    detail = edge * (edge / coarse.clamp_min(1e-12)).clamp_max(1)
+    sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail).sqrt()
     return torch.where(seen, confidence_of(sigma), 0.0).double().cpu().numpy()
 
 
-def _detail(of: Observed, seen: Tensor, noise: Tensor) -> Tensor:
-    """(V,) |n - k|^2 / 2 without what noise with this variance (V,) along a tangent adds to it in the mean."""
-    total, count = _summed(of.vertices.normal, seen, of.surface)
-    count = count.clamp_min(1)
-    apart = (of.vertices.normal - total / count[:, None]).square().sum(1) / 2
-    return torch.where(total.square().sum(1) > 0, apart - (1 + 1 / count) * noise, 0.0)
+def _bands(of: Observed, seen: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+    """(V,) each D and C without what noise with this variance (V,) along a tangent adds to them in the mean."""
+    near = [of.vertices.normal]
+    for _ in range(4):
+        total, count = _summed(near[-1], seen, of.surface)
+        alone = (count == 0)[:, None]
+        near.append(torch.where(alone, near[-1], total / count.clamp_min(1)[:, None]))
+    share = 1 / count.clamp_min(1)
+    at_edges, at_twice = ((a - b).square().sum(1) / 2 for a, b in ((near[0], near[1]), (near[1], near[4])))
+    return at_edges - (1 + share) * noise, at_twice - share * noise
 
 
 def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> tuple[Tensor, ...]:
