@@ -12,7 +12,8 @@ from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 from mvps import evaluate, render, view
 from mvps.command import run
 from mvps.export import read_reconstruction, write_reconstruction
-from mvps.same_object import capture_of, overlap_of
+from mvps.load import read_capture, read_truth
+from mvps.same_object import LEAST_OVERLAP, capture_of, overlap_of
 from mvps.scene import Surface, Truth
 from mvps.synthetic.files import write_capture
 from mvps.visibility import camera_hits, ray_caster
@@ -39,6 +40,19 @@ def folders(scene: SphereScene, tmp_path_factory: pytest.TempPathFactory) -> tup
 def test_a_result_covers_the_masks_of_its_own_capture(scene: SphereScene) -> None:
     caster = ray_caster(scene.reconstruction.surface)
     assert min(overlap_of(caster, view.camera, view.mask) for view in scene.capture.views) > 0.97
+
+
+def test_true_objects_cover_their_own_masks_and_not_each_others(captures: Path) -> None:
+    """Where LEAST_OVERLAP comes from: objects of one rig, all about its middle."""
+    names = ("bunny", "armadillo", "spot", "buddha")
+    views = {name: read_capture(captures / name, lights=[1]).views for name in names}
+    for name in names:
+        surface = read_truth(captures / name).surface
+        assert surface is not None
+        caster = ray_caster(surface)
+        for other in names:
+            overlap = np.median([overlap_of(caster, view.camera, view.mask) for view in views[other]])
+            assert overlap > 0.98 if other == name else overlap < LEAST_OVERLAP
 
 
 @pytest.mark.parametrize("width", [64, 100, 1024])

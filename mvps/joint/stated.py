@@ -18,7 +18,7 @@ the surface is smooth. Of each tangential component
     sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2 + D min(D / C, 1)
 
 where the tie to the mesh stands in where samples say little. A vertex has few clusters, so its figures are averaged with its neighbours'.
-No constant is fitted to true normals.
+No constant is fitted to true normals; the last term's form was chosen with true normals in view (docs/method.md).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mvps.joint.observe import ViewSamples
 from mvps.joint.reflectance import Observed
 from mvps.joint.steps import confidence_of
 from mvps.mesh import edges, normalise, vertex_normals
-from mvps.scene import Float, Law, Surface
+from mvps.scene import Float, Law
 from solvers.least_squares import columns_of_inverse
 
 ROUNDS = 2
@@ -61,19 +61,20 @@ def stated_confidence(of: Observed, tie: float) -> Float:
     variance = torch.where(seen, variance.clamp(1e-12, 1.0), 0.0)
     away = of.vertices.normal - torch.tensor(vertex_normals(of.surface)).to(of.vertices.normal)
     noise = torch.where(seen, scale * (bread[:, 0, 0] + bread[:, 1, 1]) / 2, 0.0)
-    terms = torch.stack([variance, away.square().sum(1) / 2, *_bands(of, seen, noise)], 1)
-    variance, apart, edge, coarse = _averaged(terms, seen, of.surface).unbind(1)
+    ends = torch.from_numpy(edges(of.surface)).to(seen.device)
+    terms = torch.stack([variance, away.square().sum(1) / 2, *_bands(of.vertices.normal, seen, noise, ends)], 1)
+    variance, apart, edge, coarse = _averaged(terms, seen, ends).unbind(1)
     edge = edge.clamp_min(0)
     detail = edge * (edge / coarse.clamp_min(1e-12)).clamp_max(1)
     sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail).sqrt()
     return torch.where(seen, confidence_of(sigma), 0.0).double().cpu().numpy()
 
 
-def _bands(of: Observed, seen: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-    """(V,) each D and C without what noise with this variance (V,) along a tangent adds to them in the mean."""
-    near = [of.vertices.normal]
+def _bands(normal: Tensor, seen: Tensor, noise: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+    """(V,) each D and C without what noise with this variance (V,) along a tangent adds to them in the mean; ends (E, 2) of the edges."""
+    near = [normal]
     for _ in range(4):
-        total, count = _summed(near[-1], seen, of.surface)
+        total, count = _summed(near[-1], seen, ends)
         alone = (count == 0)[:, None]
         near.append(torch.where(alone, near[-1], total / count.clamp_min(1)[:, None]))
     share = 1 / count.clamp_min(1)
@@ -105,17 +106,16 @@ def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[Directional
     return hessian, meat, of_kinds, squares, count
 
 
-def _averaged(values: Tensor, known: Tensor, surface: Surface) -> Tensor:
+def _averaged(values: Tensor, known: Tensor, ends: Tensor) -> Tensor:
     """(V, k) values, where known, averaged with their neighbours'."""
     for _ in range(ROUNDS):
-        total, count = _summed(values, known, surface)
+        total, count = _summed(values, known, ends)
         values = (total + values * known[:, None]) / (count + known.to(count))[:, None].clamp_min(1)
     return values
 
 
-def _summed(values: Tensor, known: Tensor, surface: Surface) -> tuple[Tensor, Tensor]:
+def _summed(values: Tensor, known: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     """(V, k) sums of the values (V, k) of a vertex's known neighbours, and (V,) how many these are."""
-    ends = torch.from_numpy(edges(surface)).to(known.device)
     own = torch.cat([values, torch.ones_like(values[:, :1])], 1) * known[:, None]
     around = torch.zeros_like(own)
     for here, there in ((0, 1), (1, 0)):
