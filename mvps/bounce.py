@@ -37,6 +37,9 @@ BOUNCES = 3
 PATCH_EDGES = 3.0
 """Size of a patch over the mesh's edges: some eight vertices; with 5 narrow hollows share a patch with their rims (docs/method.md)."""
 
+PATCHES_AT_ONCE = 4096
+"""Whose rays are traced together: half a million."""
+
 NEIGHBOURS = 4
 """Patches that a point interpolates."""
 
@@ -71,18 +74,24 @@ def gather(surface: Surface, size: float) -> Gather:
     key = np.ravel_multi_index((*cube.T, octant), (*cube.max(0) + 1, 8))
     _, vertex, patch = np.unique(key, return_index=True, return_inverse=True)
     normal, places = normals[vertex], surface.vertices[vertex]
-    directions = _around(normal, _cosine_directions(RAYS))
-    origins = np.repeat(places + LIFT_EDGES * mean_edge_length(surface) * normal, RAYS, axis=0)
-    hits = caster.first_hits(origins, directions)
-    # A ray that meets the back of a face started below a facet.
-    seen = np.flatnonzero(hits.face >= 0)
-    seen = seen[(face_normals(surface)[hits.face[seen]] * directions[seen]).sum(1) < 0]
-    rows = seen // RAYS
-    columns = patch[surface.faces[hits.face[seen], 0]]
+    starts, facing = places + LIFT_EDGES * mean_edge_length(surface) * normal, face_normals(surface)
+
+    def met(first: int) -> tuple[Int, Int, NDArray[np.float32]]:
+        """Row, face and direction of the rays of some patches that meet another part."""
+        some = slice(first, first + PATCHES_AT_ONCE)
+        directions = _around(normal[some], _cosine_directions(RAYS))
+        hits = caster.first_hits(np.repeat(starts[some], RAYS, axis=0), directions)
+        # A ray that meets the back of a face started below a facet.
+        seen = np.flatnonzero(hits.face >= 0)
+        seen = seen[(facing[hits.face[seen]] * directions[seen]).sum(1) < 0]
+        return first + seen // RAYS, hits.face[seen], directions[seen].astype(np.float32)
+
+    rows, faces, along = (np.concatenate(parts) for parts in zip(*map(met, range(0, len(vertex), PATCHES_AT_ONCE)), strict=True))
+    columns = patch[surface.faces[faces, 0]]
     S = sp.csr_matrix((np.full(len(rows), 1 / RAYS, np.float32), (rows, columns)), (len(vertex), len(vertex)))
     spread = np.bincount(patch, ((normals - normal[patch]) ** 2).sum(1) / 2) / np.bincount(patch)
     start = np.searchsorted(rows, np.arange(len(vertex) + 1))
-    return Gather(caster, vertex, normal, S, cKDTree(places), spread, rows, start, columns, directions[seen].astype(np.float32))
+    return Gather(caster, vertex, normal, S, cKDTree(places), spread, rows, start, columns, along)
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from sphere_scene import make_sphere
 
-from mvps.bounce import gathered
+from mvps.bounce import PATCH_EDGES, gathered
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.gleam import coarse_senders, shiny, terms
 from mvps.joint.refine import refine
@@ -76,7 +76,13 @@ def ungained(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     returned.cache_clear()
 
 
-@pytest.mark.usefixtures("ungained")
+@pytest.fixture
+def patches_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Patches of lobed surfaces as large as those of diffuse ones."""
+    monkeypatch.setattr("mvps.gleam.LOBES_PATCH_EDGES", PATCH_EDGES)
+
+
+@pytest.mark.usefixtures("ungained", "patches_alike")
 def test_a_lobe_as_wide_as_the_hemisphere_sends_and_takes_what_a_diffuse_surface_does() -> None:
     surface = corner()
     diffuse = coarse_senders(surface, made_of(surface, 0.5, (), (), bounce=0.8), grey=True)
@@ -89,7 +95,7 @@ def test_a_lobe_as_wide_as_the_hemisphere_sends_and_takes_what_a_diffuse_surface
         assert np.allclose(by_lobes[:, :, k], G[:, :, 0], atol=1e-5)
 
 
-@pytest.mark.usefixtures("ungained")
+@pytest.mark.usefixtures("ungained", "patches_alike")
 def test_albedo_and_lobes_share_what_is_sent() -> None:
     """Half of the reflectance as albedo, half as a lobe: all together is what it was; the part of albedo alone has only its own bounces."""
     surface = corner()
@@ -101,7 +107,7 @@ def test_albedo_and_lobes_share_what_is_sent() -> None:
     assert np.allclose(parts[:, :, 0], gathered(halves.sources, LIGHTS, 0.8))
 
 
-@pytest.mark.usefixtures("ungained")
+@pytest.mark.usefixtures("ungained", "patches_alike")
 def test_photographs_and_textures_of_a_wide_lobe_are_those_of_a_diffuse_surface() -> None:
     surface = corner()
     matt, lobed = made_of(surface, 0.5, (), (), bounce=0.8), made_of(surface, 0.0, (0.5,), (WIDE,), gleam=0.8)
@@ -137,6 +143,7 @@ def test_sharp_lobes_send_to_the_mirror_direction() -> None:
     assert G[:, 0].mean() > 3 * G[:, 1].mean() > 0
 
 
+@pytest.mark.usefixtures("patches_alike")
 def test_the_gain_at_grazing_angles_is_bounded() -> None:
     surface = corner()
     material = made_of(surface, 0.0, (1.0,), (WIDE,), gleam=1e-9)

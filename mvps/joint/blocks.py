@@ -13,7 +13,9 @@ with D_x = 1 + g (1 - n.x)^p (shading.py) and G the light that other surfaces se
             (the half vector moves with l; the last term in the bracket only below the gain's bound, shading.STEEPEST)
     dI/dg = q a ((1 - n.l)^p D_v + (1 - n.v)^p D_l),   dI/db = a e G_0,   dI/dy = e (a G_1 + sum_k w_k G_2+k)
 
-Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale per vertex, the standard deviation of its weighted residuals.
+Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale s per vertex, the standard deviation of its weighted residuals. What lobes
+send, u = e y (a G_1 + sum_k w_k G_2+k), hangs on shapes that are not yet right, their normals above all: it adds u^2 to a sample's
+variance s^2 (LOBES_ERROR), so that samples that surfaces light directly say what normals are.
 Every block is Gauss-Newton: normal equations are accumulated over batches of pairs, never a Jacobian as a whole, and add up over views.
 Batches are single-threaded and views are dealt to threads: torch's own threads would meet at a barrier after every one of some thirty
 small operations.
@@ -36,6 +38,9 @@ from solvers.low_rank import CAUCHY_95
 
 WORKERS = 2
 """Parts that the views are dealt into: fixed, because the order of a sum is part of its value. Two is what a laptop's cores keep busy."""
+
+LOBES_ERROR = 1.0
+"""Of light that lobes send, over that light: a wall whose normal is off by a lobe's width sends all of it elsewhere (docs/method.md)."""
 
 
 @dataclass
@@ -154,7 +159,8 @@ def batches(views: list[ViewSamples], lights: list[DirectionalLights]) -> Iterat
 class Shaded:
     """The image model on a batch of pairs, (..., n, lights) each: lit 1 above the horizon; n . l clamped at 0; h . n; c; basis dI/da and
     dI/dw_k; reflectance R, its lobes' part; slope B; of_light a D_l' D_v, of_view a D_l D_v'; missing (1 - n.l)^p and (1 - n.v)^p
-    (..., n, 1); indirect a e G_0 and gleamed dI/dy; rest, all that other surfaces send; predicted I."""
+    (..., n, 1); indirect a e G_0 and gleamed dI/dy; rest, all that other surfaces send; unsure, its standard deviation, None
+    where lobes send nothing; predicted I."""
 
     lit: Tensor
     n_dot_l: Tensor
@@ -170,6 +176,7 @@ class Shaded:
     indirect: Tensor
     gleamed: Tensor
     rest: Tensor
+    unsure: Tensor | None
     predicted: Tensor
 
 
@@ -198,6 +205,7 @@ def evaluate(
         slope = slope + steepness * weighted
         basis.append(q * value)
     indirect = gleamed = rest = torch.zeros_like(q)
+    unsure = None
     if gathered is not None:
         received = (intensity[..., None] * gathered).unbind(-1)
         indirect = albedo * received[0]
@@ -205,13 +213,29 @@ def evaluate(
         basis[0] = basis[0] + law.bounce * received[0]
         if len(received) > 1:
             gleamed = sum((reflectance[..., k, None] * g for k, g in enumerate(received[1:])), torch.zeros_like(q))
-            rest = rest + law.gleam * gleamed
+            by_lobes = law.gleam * gleamed
+            rest, unsure = rest + by_lobes, LOBES_ERROR * by_lobes
             basis = [own + law.gleam * g for own, g in zip(basis, received[1:], strict=True)]
     total = albedo * D + specular
     predicted = q * total + rest
     of_light, of_view = slant * D_v * slope_l, slant * slope_v * D_l
     return Shaded(
-        n_dot_l.sign(), n_dot_l, half, c, basis, total, specular, slope, of_light, of_view, (of_l, of_v), indirect, gleamed, rest, predicted
+        n_dot_l.sign(),
+        n_dot_l,
+        half,
+        c,
+        basis,
+        total,
+        specular,
+        slope,
+        of_light,
+        of_view,
+        (of_l, of_v),
+        indirect,
+        gleamed,
+        rest,
+        unsure,
+        predicted,
     )
 
 
@@ -253,9 +277,10 @@ def law_derivatives(shaded: Shaded, reflectance: Tensor, lights: DirectionalLigh
     return [reflectance[..., :1] * lights.intensity * shaded.n_dot_l * changed, shaded.indirect, shaded.gleamed]
 
 
-def robust(residual: Tensor, scale: Tensor) -> Tensor:
-    """Cauchy's weight of residuals (..., n, lights) with scale (..., n)."""
-    return 1 / (1 + (residual / (CAUCHY_95 * scale[..., None])) ** 2)
+def robust(residual: Tensor, scale: Tensor, unsure: Tensor | None) -> Tensor:
+    """Cauchy's weight of residuals (..., n, lights) with scale (..., n), to whose square unsure (..., n, lights) adds its own."""
+    excess = 1 + (residual / (CAUCHY_95 * scale[..., None])) ** 2
+    return 1 / (excess if unsure is None else excess + (unsure / scale[..., None]) ** 2)
 
 
 def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
@@ -267,7 +292,7 @@ def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list
         index, towards = batch.vertex, batch.towards
         shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
         residual = shaded.predicted - batch.image
-        weight = batch.weight * robust(residual, vertices.scale[index])
+        weight = batch.weight * robust(residual, vertices.scale[index], shaded.unsure)
         rows = torch.stack([*vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights), residual], -2)
         batch.added(sums, (rows * weight[..., None, :]) @ rows.mT)
         batch.added(count, weight.sum(-1))

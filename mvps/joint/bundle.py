@@ -95,7 +95,7 @@ def _rows(
     by_camera = by_point @ derivatives(view.camera, body, local)
     by_offset = by_point @ (outward @ view.camera.rotation.T)[..., None]
     predicted = torch.stack(vertex_derivatives(shaded, tangents(normal), samples.towards, lights), -1).double().numpy()
-    weight = samples.weight[:, None] * samples.data * robust(residual, scale) / scale[:, None] ** 2
+    weight = samples.weight[:, None] * samples.data * robust(residual, scale, shaded.unsure) / scale[:, None] ** 2
     return residual.double().numpy(), weight.double().numpy() * known[:, None], by_camera, np.concatenate([by_offset, -predicted], -1)
 
 

@@ -65,7 +65,7 @@ def _step(
             index, towards = samples.vertex[part], samples.towards[part]
             shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, of_view, law, samples.gathered_of(part))
             residual = shaded.predicted - samples.image[part]
-            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index])
+            weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index], shaded.unsure)
             J = light_jacobian(shaded, vertices.normal[index], towards, of_view, law, rotation)
             H += torch.einsum("pl,pil,pjl->lij", weight, J, J)
             g += torch.einsum("pl,pil,pl->li", weight, J, residual)

@@ -129,7 +129,7 @@ def _sums(
         normal, reflectance, scale = (values[index] for values in (vertices.normal, vertices.reflectance, vertices.scale))
         shaded = evaluate(normal, reflectance, towards, batch.lights, law, batch.gathered)
         residual = shaded.predicted - batch.image
-        weight = batch.weight * robust(residual, scale)
+        weight = batch.weight * robust(residual, scale, shaded.unsure)
         batch.added(sums.count, weight.sum(-1))
         of_vertex = vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights)
         rows = torch.stack([*of_vertex, *law_derivatives(shaded, reflectance, batch.lights, law), residual], -2)

@@ -94,7 +94,8 @@ def _sums(of: Observed, every: int, first: int) -> Tensor:
             normal, scale = vertices.normal[index], vertices.scale[index]
             shaded = evaluate(normal, vertices.reflectance[index], towards, lights, of.law, samples.gathered_of(part))
             residual = samples.image[part] - shaded.predicted
-            weight = samples.weight[part, None] * samples.data[part] * robust(residual, scale) / (CORRELATED * scale[:, None] ** 2)
+            certain = robust(residual, scale, shaded.unsure) / (CORRELATED * scale[:, None] ** 2)
+            weight = samples.weight[part, None] * samples.data[part] * certain
             direct, _ = _split(shaded)
             rows = torch.cat([moments(normal, towards, lights.direction) * direct[..., None], residual[..., None]], -1)
             sums.index_add_(0, index, (rows * weight[..., None]).transpose(1, 2) @ rows)

@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.bounce import PATCH_EDGES, Gather, gather
+from mvps.bounce import Gather
 from mvps.camera import pixel_footprint
 from mvps.cores import neighbours
-from mvps.gleam import Senders, senders, shiny
+from mvps.gleam import Senders, patches_of, senders, shiny
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
 from mvps.joint.lights import light_step, subset, with_mean_one
@@ -32,7 +32,7 @@ from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albed
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose, judged
-from mvps.mesh import angles_deg, edges, lengths, mean_edge_length, normalise, vertex_normals
+from mvps.mesh import angles_deg, edges, lengths, normalise, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
 LIGHT_VERTICES, TRIAL_VERTICES = 4000, 1000
@@ -52,7 +52,7 @@ common (patches.py); ties of single normals hold lights to the mesh's errors."""
 @dataclass
 class State:
     """What one round hands to the next. under: the photographs, perhaps thinned, that `views` are samples of, and their lights; lobed:
-    whether lobes take part in inter-reflection (gleam.py)."""
+    whether lobes take part in inter-reflection (gleam.py); patches: what sends light on, without lobes and with them, once asked for."""
 
     surface: Surface
     lights: Lights
@@ -60,7 +60,7 @@ class State:
     law: Law
     model: Model
     vertices: Vertices | None = None
-    coarse: Gather | None = None
+    patches: dict[bool, Gather] = field(default_factory=dict)
     lobed: bool = False
     views: list[ViewSamples] = field(default_factory=list)
     under: tuple[Capture, Lights] | None = None
@@ -243,10 +243,12 @@ def light_change(a: Lights, b: Lights) -> tuple[float, float]:
 
 def _senders(state: State, vertices: Vertices) -> Senders | None:
     """What sends light on, by the vertices' reflectance; None where inter-reflection is not modelled."""
-    if state.coarse is None or not (state.model.bounce or state.lobed):
+    if not (state.model.bounce or state.lobed):
         return None
+    if state.lobed not in state.patches:
+        state.patches[state.lobed] = patches_of(state.surface, state.lobed)
     albedo, weight = _reflectance(vertices)
-    return senders(state.coarse, state.surface, state.law, albedo, weight if state.lobed else None)
+    return senders(state.patches[state.lobed], state.surface, state.law, albedo, weight if state.lobed else None)
 
 
 def _lit(state: State, views: list[ViewSamples], of: Capture, lights: Lights, sent: Senders | None) -> list[ViewSamples]:
@@ -277,8 +279,6 @@ def photometric_round(
         among = np.zeros(len(mesh_normal), bool)
         among[patches.vertex.cpu().numpy()] = True
         few = observe(capture, state.surface, state.lights, device, among, state.law.shadows)
-    if state.coarse is None:
-        state.coarse = gather(state.surface, PATCH_EDGES * mean_edge_length(state.surface))
 
     choosing = task.choose and not state.trials
     if choosing:

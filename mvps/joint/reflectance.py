@@ -57,7 +57,8 @@ def chunks(of: Observed, i: int) -> Iterator[Chunk]:
         part = slice(start, start + PAIRS_PER_CHUNK)
         index, towards = samples.vertex[part], samples.towards[part]
         shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, lights, of.law, samples.gathered_of(part))
-        weight = samples.weight[part, None] * samples.data[part] * robust(shaded.predicted - samples.image[part], vertices.scale[index])
+        residual = shaded.predicted - samples.image[part]
+        weight = samples.weight[part, None] * samples.data[part] * robust(residual, vertices.scale[index], shaded.unsure)
         diffuse = shaded.basis[0] * vertices.reflectance[index, :1]
         rows = index.cpu().numpy()
         positions, weights = bilinear(view.pixel_index, project(view.camera, of.surface.vertices[rows])[0])

@@ -94,7 +94,7 @@ def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[Directional
         kind = torch.nn.functional.one_hot((batch.lights.direction @ corners.T).argmax(-1), len(corners)).to(like)
         shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
         residual = shaded.predicted - batch.image
-        weight = batch.weight * robust(residual, vertices.scale[index])
+        weight = batch.weight * robust(residual, vertices.scale[index], shaded.unsure)
         rows = torch.stack(vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights), -2)
         by_kind = ((rows * (weight * residual)[..., None, :]) @ kind[:, None]).mT
         by_view = by_kind.sum(-2)
