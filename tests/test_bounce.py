@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import trimesh
 
 from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, sources_on
@@ -100,3 +101,12 @@ def test_colours_mix_channel_by_channel_and_interpolate_to_points() -> None:
     assert np.allclose(G[..., 1], 2 * G[..., 0], atol=1e-5) and np.allclose(G[..., 2], 4 * G[..., 0], atol=1e-5)
     values = at(sources, G, room.vertices, vertex_normals(room))
     assert values.shape == (len(room.vertices), 2, 3) and values.min() >= 0 and values.max() <= G.max() + 1e-6
+
+
+def test_patches_are_the_same_traced_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = gather(hollow(), 2.0)
+    monkeypatch.setattr("mvps.bounce.PATCHES_AT_ONCE", 7)
+    parts = gather(hollow(), 2.0)
+    assert len(whole.normal) > 70 and (whole.S != parts.S).nnz == 0
+    for name in ("row", "start", "column", "along"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))

@@ -16,7 +16,10 @@ from sphere_scene import make_sphere
 from mvps.bounce import PATCH_EDGES, gathered
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.gleam import coarse_senders, shiny, terms
+from mvps.joint.blocks import LOBES_ERROR, DirectionalLights, Vertices, evaluate, robust
+from mvps.joint.observe import ViewSamples
 from mvps.joint.refine import refine
+from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.material import LARGEST
 from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.plan import Parts, last_pass
@@ -27,6 +30,7 @@ from mvps.synthetic.scene import make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
 from mvps.texture import bake, pixel_albedo
 from mvps.visibility import RayCaster, ray_caster
+from solvers.low_rank import CAUCHY_95
 
 WIDE = 1e-6
 """Sharpness of a lobe that is one everywhere."""
@@ -244,3 +248,44 @@ def test_a_result_without_gleam_is_one_whose_lobes_send_each_other_nothing(tmp_p
     np.savez(path, **kept)
     with pytest.raises(CaptureError, match="bounce"):
         read_reconstruction(tmp_path / "result")
+
+
+def test_what_lobes_send_is_as_unsure_as_it_is_strong() -> None:
+    """A sample that holds as much of it as its vertex's residuals are large counts half; diffuse light changes no weight."""
+    residual, scale = torch.tensor([[0.0, 0.02]]), torch.tensor([0.01])
+    plain = robust(residual, scale, None)
+    assert torch.allclose(plain, 1 / (1 + (residual / (CAUCHY_95 * 0.01)) ** 2))
+    assert torch.allclose(robust(residual, scale, torch.full((1, 2), 0.01)), 1 / (1 / plain + 1))
+    normal, lights = torch.tensor([[0.0, 0.0, 1.0]]), DirectionalLights(torch.tensor([[0.0, 0.6, 0.8]]), torch.tensor([2.0]))
+    law, reflectance = Law((20.0,), 0.0, 0.7, gleam=0.5), torch.tensor([[0.4, 0.3]])
+    diffuse = evaluate(normal, reflectance, normal, lights, law, torch.tensor([[[0.1]]]))
+    lobed = evaluate(normal, reflectance, normal, lights, law, torch.tensor([[[0.1, 0.2, 0.3]]]))
+    assert diffuse.unsure is None and lobed.unsure is not None
+    assert torch.allclose(lobed.unsure, LOBES_ERROR * 0.5 * 2.0 * torch.tensor([[0.4 * 0.2 + 0.3 * 0.3]]))
+
+
+def test_normals_hold_where_lobes_send_other_light_than_is_thought(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Walls whose shape is not yet right send half of what they will: samples that they hardly reach say what the normals are."""
+    g = torch.Generator().manual_seed(5)
+    n, count, law = 200, 16, Law((10.0,), 0.0, 0.0, gleam=1.0)
+
+    def units(many: int, centre: tuple[float, float, float], spread: float) -> torch.Tensor:
+        return torch.nn.functional.normalize(torch.tensor(centre) + spread * torch.randn(many, 3, generator=g), dim=1)
+
+    lights = [DirectionalLights(units(count, (0, 0, 1), 0.5), torch.ones(count))]
+    normal, towards = units(n, (0, 0, 1), 0.3), units(n, (0, 0, 1), 0.1)
+    reflectance = torch.tensor([[0.05, 0.5]]).repeat(n, 1)
+    # Of every second light nothing arrives by way of others.
+    sent = torch.rand(n, count, 3, generator=g) * torch.tensor([0.0, 1.0])[torch.arange(count) % 2][:, None] * 0.3
+    image = evaluate(normal, reflectance, towards, lights[0], law, sent).predicted
+    every = torch.ones(n, count, dtype=torch.bool)
+    samples = [ViewSamples(torch.arange(n), towards, torch.ones(n), image, every, sent / 2)]
+
+    def off(error: float) -> float:
+        monkeypatch.setattr("mvps.joint.blocks.LOBES_ERROR", error)
+        state = Vertices(normal, reflectance, torch.full((n,), 0.05))
+        for _ in range(10):
+            state = vertex_step(samples, state, lights, law, free_reflectance(normal, 1.0, 2))
+        return float(angles_deg(state.normal.numpy(), normal.numpy()).mean())
+
+    assert off(1.0) < 0.5 * off(0.0) and off(0.0) > 1
