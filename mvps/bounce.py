@@ -145,9 +145,24 @@ def series(S: sp.csr_matrix, direct: NDArray[np.float32], again: NDArray[np.floa
     return G
 
 
-def gathered(sources: Sources, direction: Float, bounce: float) -> NDArray[np.float32]:
-    """G (n, lights) or (n, lights, channels) on the patches under lights direction (lights, 3)."""
-    lit = lit_by(sources.of, direction)
+def lit_by_points(of: Gather, position: Float) -> tuple[Float, NDArray[np.float32]]:
+    """Direction (n, points, 3), unit, from the patches to points of light, position (points, 3), and (n, points) max(n.l, 0) * shadow over
+    the squared distance."""
+    places = of.caster.surface.vertices[of.vertex]
+    apart = position - places[:, None]
+    distance = np.linalg.norm(apart, axis=-1)
+    direction = apart / distance[..., None]
+    facing = (of.normal[:, None] * direction).sum(-1)
+    for k, towards in enumerate(direction.swapaxes(0, 1)):
+        above = np.flatnonzero(facing[:, k] > 0)
+        hits = of.caster.first_hits(places[above] + of.caster.offset * of.normal[above], towards[above])
+        facing[above[hits.distance < distance[above, k]], k] = 0
+    lit: NDArray[np.float32] = (np.maximum(facing, 0) / distance**2).astype(np.float32)
+    return direction, lit
+
+
+def gathered(sources: Sources, lit: NDArray[np.float32], bounce: float) -> NDArray[np.float32]:
+    """G (n, lights) or (n, lights, channels) on the patches, lit (n, lights) as `lit_by` says."""
 
     def of_channel(albedo: Float) -> NDArray[np.float32]:
         direct = lit * albedo.astype(np.float32)[:, None]

@@ -30,7 +30,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mvps.bounce import BOUNCES, PATCH_EDGES, RAYS, Gather, Sources, gather, gathered, lit_by, series, sources_on
+from mvps.bounce import BOUNCES, PATCH_EDGES, RAYS, Gather, Sources, gather, gathered, lit_by, lit_by_points, series, sources_on
 from mvps.mesh import mean_edge_length, normalise
 from mvps.scene import Float, Law, Material, Surface
 from mvps.shading import PARALLEL, gain_of, lobe_of, returned
@@ -94,19 +94,28 @@ def coarse_senders(surface: Surface, material: Material, grey: bool = False) -> 
 def terms(of: Senders, direction: Float, eye: Float) -> Single:
     """G (n, lights, 1 or 2 + lobes) on the patches, or (n, lights, 1 or 2 + lobes, channels), under lights direction (lights, 3), seen from
     a camera at eye (3,). One term where lobes take no part."""
+    return _terms(of, direction, lit_by(of.sources.of, direction), eye)
+
+
+def terms_of_points(of: Senders, position: Float, eye: Float) -> Single:
+    """The same under points of light, position (points, 3), over their strength (illumination.py) in place of the lights' intensity."""
+    return _terms(of, *lit_by_points(of.sources.of, position), eye)
+
+
+def _terms(of: Senders, direction: Float, lit: Single, eye: Float) -> Single:
+    """direction (lights, 3), or (n, lights, 3) of every patch; lit (n, lights)."""
     if of.weight is None:
-        return np.expand_dims(gathered(of.sources, direction, of.law.bounce), 2)
+        return np.expand_dims(gathered(of.sources, lit, of.law.bounce), 2)
     net, law, albedo = of.sources.of, of.law, of.sources.albedo
     coloured = albedo.ndim == 2
     a = (albedo if coloured else albedo[:, None]).astype(np.float32)
     w = of.weight if of.weight.ndim == 3 else of.weight[..., None]
     w = np.broadcast_to(w, (*w.shape[:2], a.shape[1])).astype(np.float32)
-    lit = lit_by(net, direction)
     later = _later(net, law, a, w, lit)
-    G = np.zeros((len(a), len(direction), 2 + w.shape[1], a.shape[1]), np.float32)
-    diffuse = gathered(of.sources, direction, law.bounce)
+    G = np.zeros((*lit.shape, 2 + w.shape[1], a.shape[1]), np.float32)
+    diffuse = gathered(of.sources, lit, law.bounce)
     G[:, :, 0] = diffuse if coloured else diffuse[..., None]
-    for patches, rays in _parts(net, len(direction)):
+    for patches, rays in _parts(net, lit.shape[1]):
         sent, taken = _sent(net, law, a, w, lit, later, direction, rays), _taken(net, law, eye, rays)
         starts = net.start[patches.start : patches.stop + 1] - rays.start
         for k, share in enumerate(taken):
@@ -149,8 +158,12 @@ def _sent(net: Gather, law: Law, a: Single, w: Single, lit: Single, later: Singl
     """L (rays, lights, channels)."""
     column, along = net.column[rays], net.along[rays]
     normal, light = net.normal.astype(np.float32), direction.astype(np.float32)
-    length = np.sqrt(np.maximum(2 - 2 * along @ light.T, PARALLEL))
-    towards = (normal @ light.T)[column] - np.einsum("ri,ri->r", normal[column], along)[:, None]
+    if light.ndim == 2:
+        of_ray, of_normal = along @ light.T, (normal @ light.T)[column]
+    else:
+        of_ray, of_normal = (np.einsum("ri,rli->rl", vectors, light[column]) for vectors in (along, normal[column]))
+    length = np.sqrt(np.maximum(2 - 2 * of_ray, PARALLEL))
+    towards = of_normal - np.einsum("ri,ri->r", normal[column], along)[:, None]
     sent = np.broadcast_to(a[column, None], (*length.shape, a.shape[1])).copy()
     for k, value in enumerate(_lobes(law, net.spread[column], towards, length)):
         sent += value[..., None] * w[column, k][:, None]

@@ -18,7 +18,7 @@ from mvps.camera import view_directions
 from mvps.gleam import Senders
 from mvps.illumination import Illumination
 from mvps.mesh import lengths
-from mvps.rendering import Points, light_arriving, points_under, shaded, shadow_at, specular_shading
+from mvps.rendering import Arriving, Points, light_arriving, light_arriving_of_points, points_under, shaded, shadow_at, specular_shading
 from mvps.scene import Bool, Camera, Float, Int, Material
 from mvps.visibility import RayCaster
 
@@ -42,7 +42,7 @@ def rendered(
     image, specular: linear radiance; albedo; normals: refined ones, world frame; depth: along the optical axis, world units; shadow: part
     of the arriving light that other parts of the surface hide; confidence.
 
-    senders: what sends light on (rendering.light_senders), for inter-reflection of the directional lights; None: without.
+    senders: what sends light on (rendering.light_senders), for inter-reflection; None: without.
     """
     side = int(np.sqrt(SUBPIXELS))
     fine = Camera(np.diag([side, side, 1.0]) @ camera.K, camera.rotation, camera.translation, side * camera.height, side * camera.width)
@@ -108,10 +108,9 @@ def _lit(
         specular += np.einsum("nlc,nl,lc->nc", np.broadcast_to(lobes, (*shadow.shape, 3)), ~shadow, intensity)
         flux = np.maximum(points.normal @ direction.T, 0) * intensity.mean(1)
         hidden, arriving = hidden + (flux * shadow).sum(1), arriving + flux.sum(1)
-        others = light_arriving(senders, direction, camera.centre)
-        if others is not None:
-            of_albedo, of_lobes = others.at(points)
-            image += np.einsum("nlc,lc->nc", points.albedo[:, None] * of_albedo + of_lobes, intensity)
+        image += _sent(light_arriving(senders, direction, camera.centre), points, intensity)
+    if len(light.position):
+        image += _sent(light_arriving_of_points(senders, light.position, camera.centre), points, light.strength)
     for position, strength in zip(light.position, light.strength, strict=True):
         apart = position - points.position
         distance = lengths(apart)[:, None]
@@ -123,6 +122,15 @@ def _lit(
         flux = np.maximum((points.normal * towards).sum(1), 0) * intensity.mean(1)
         hidden, arriving = hidden + flux * shadow, arriving + flux
     return {"image": image, "specular": specular, "shadow": hidden / np.maximum(arriving, 1e-12)}
+
+
+def _sent(arriving: Arriving | None, points: Points, strength: Float) -> Float:
+    """(n, 3) radiance that points return of what other surfaces send them, under lights of this strength (lights, 3)."""
+    if arriving is None:
+        return np.zeros_like(points.albedo)
+    of_albedo, of_lobes = arriving.at(points)
+    sent: Float = np.einsum("nlc,lc->nc", points.albedo[:, None] * of_albedo + of_lobes, strength)
+    return sent
 
 
 def _shadow_of_point(caster: RayCaster, points: Points, towards: Float, distance: Float) -> Bool:

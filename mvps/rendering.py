@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mvps.bounce import at
 from mvps.camera import view_directions
-from mvps.gleam import Senders, coarse_senders, terms
+from mvps.gleam import Senders, coarse_senders, terms, terms_of_points
 from mvps.mesh import normalise
 from mvps.neural import factor
 from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
@@ -98,6 +98,11 @@ def light_senders(surface: Surface, material: Material) -> Senders | None:
 def light_arriving(senders: Senders | None, direction: Float, eye: Float) -> Arriving | None:
     """What arrives from senders under lights direction (lights, 3), for a camera at eye (3,)."""
     return None if senders is None else Arriving(senders, terms(senders, direction, eye))
+
+
+def light_arriving_of_points(senders: Senders | None, position: Float, eye: Float) -> Arriving | None:
+    """What arrives from senders under points of light, position (points, 3), per unit of their strength (illumination.py)."""
+    return None if senders is None else Arriving(senders, terms_of_points(senders, position, eye))
 
 
 def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: float) -> NDArray[np.float32]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, sources_on
+from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, lit_by, sources_on
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Surface
 from mvps.visibility import cast_shadow
@@ -32,10 +32,15 @@ def coarse_sources(surface: Surface, albedo: np.ndarray) -> Sources:
     return sources_on(gather(surface, PATCH_EDGES * mean_edge_length(surface)), surface, albedo)
 
 
+def under(sources: Sources, direction: np.ndarray, bounce: float) -> np.ndarray:
+    """G under lights direction (lights, 3)."""
+    return gathered(sources, lit_by(sources.of, direction), bounce)
+
+
 def test_a_convex_body_sends_itself_nothing() -> None:
     sources = coarse_sources(ball(), np.ones(2562))
     assert occupied(sources.of).max() == 0
-    assert gathered(sources, np.array([[0, 0, 1.0]]), 1.0).max() == 0
+    assert under(sources, np.array([[0, 0, 1.0]]), 1.0).max() == 0
 
 
 def test_inside_a_closed_surface_other_surfaces_fill_every_hemisphere() -> None:
@@ -57,7 +62,7 @@ def test_every_place_in_a_part_of_a_ball_sees_the_same_share_of_it_and_its_lit_p
     assert abs(occupied(of)[deep].mean() / (height / 20.0) - 1) < 0.03
     light = np.array([[0.6, 0.0, 0.8]])
     dark = cast_shadow(of.caster, of.vertex, light)[:, 0]
-    received = gathered(sources_on(of, cap, np.ones(len(cap.vertices))), light, 0.0)[:, 0]
+    received = under(sources_on(of, cap, np.ones(len(cap.vertices))), light, 0.0)[:, 0]
     assert (deep & dark).sum() > 50 and (deep & ~dark).sum() > 50
     assert abs(received[deep & dark].mean() / received[deep & ~dark].mean() - 1) < 0.04
 
@@ -72,7 +77,7 @@ def test_bounces_in_a_closed_white_furnace_add_up_to_the_geometric_series() -> N
     for _ in range(2):
         G = sources.of.S @ (L + 0.4 * G)
     assert np.abs(G - expected).max() < 0.05
-    assert gathered(sources, np.array([[0, 0, 1.0]]), 0.8).shape == (len(L), 1)
+    assert under(sources, np.array([[0, 0, 1.0]]), 0.8).shape == (len(L), 1)
 
 
 def test_two_plates_that_face_each_other_light_each_other_by_their_view_factor() -> None:
@@ -96,7 +101,7 @@ def test_colours_mix_channel_by_channel_and_interpolate_to_points() -> None:
     room = hollow()
     albedo = np.tile([0.2, 0.4, 0.8], (len(room.vertices), 1))
     sources = coarse_sources(room, albedo)
-    G = gathered(sources, np.array([[0, 0, 1.0], [1.0, 0, 0]]), 0.0)
+    G = under(sources, np.array([[0, 0, 1.0], [1.0, 0, 0]]), 0.0)
     assert G.shape == (len(sources.albedo), 2, 3)
     assert np.allclose(G[..., 1], 2 * G[..., 0], atol=1e-5) and np.allclose(G[..., 2], 4 * G[..., 0], atol=1e-5)
     values = at(sources, G, room.vertices, vertex_normals(room))

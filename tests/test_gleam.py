@@ -13,13 +13,15 @@ import trimesh
 from numpy.typing import NDArray
 from sphere_scene import make_sphere
 
-from mvps.bounce import PATCH_EDGES, gathered
+from mvps.bounce import PATCH_EDGES, gathered, lit_by
 from mvps.export import read_reconstruction, write_reconstruction
-from mvps.gleam import coarse_senders, shiny, terms
+from mvps.gleam import Senders, coarse_senders, shiny, terms, terms_of_points
+from mvps.illumination import Illumination
 from mvps.joint.blocks import LOBES_ERROR, DirectionalLights, Vertices, evaluate, robust
 from mvps.joint.observe import ViewSamples
 from mvps.joint.refine import refine
 from mvps.joint.steps import free_reflectance, vertex_step
+from mvps.layers import rendered
 from mvps.material import LARGEST
 from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.plan import Parts, last_pass
@@ -108,7 +110,7 @@ def test_albedo_and_lobes_share_what_is_sent() -> None:
     assert whole is not None and halves is not None
     G, parts = terms(whole, LIGHTS, EYE)[:, :, 0], terms(halves, LIGHTS, EYE)
     assert np.allclose(parts[:, :, 0] + parts[:, :, 1], G, atol=1e-5) and np.allclose(parts[:, :, 2], G, atol=1e-5)
-    assert np.allclose(parts[:, :, 0], gathered(halves.sources, LIGHTS, 0.8))
+    assert np.allclose(parts[:, :, 0], gathered(halves.sources, lit_by(halves.sources.of, LIGHTS), 0.8))
 
 
 @pytest.mark.usefixtures("ungained", "patches_alike")
@@ -157,6 +159,33 @@ def test_the_gain_at_grazing_angles_is_bounded() -> None:
     once, twice = terms(sent, LIGHTS, EYE)[:, :, 1], terms(plain, LIGHTS, EYE)[:, :, 0]
     once, twice = once[twice > 0.01], twice[twice > 0.01]
     assert (once >= 0.999 * twice).all() and (once <= 1.001 * STEEPEST * twice).all() and once.mean() > 1.2 * twice.mean()
+
+
+@pytest.mark.parametrize("gleam", [0.0, 0.9])
+def test_far_points_of_light_send_on_what_lights_do_and_near_ones_fall_off(gleam: float) -> None:
+    surface = corner()
+    sent = coarse_senders(surface, made_of(surface, 0.4, (0.5,), (20.0,), bounce=0.9, gleam=gleam), grey=True)
+    assert sent is not None
+    far = 1e5
+    G = terms(sent, LIGHTS, EYE)
+    assert G.max() > 0.02 and np.allclose(far**2 * terms_of_points(sent, far * LIGHTS, EYE), G, atol=2e-3 * G.max())
+    # From the corner's own edge on, light reaches both plates alike, and a point twice as far a quarter of it.
+    near, twice = (terms_of_points(sent, np.array([[d, 0.0, d]]), EYE)[:, 0, 0].max() for d in (400.0, 800.0))
+    assert 3.6 < near / twice < 4.4
+
+
+def test_pictures_by_a_far_point_hold_what_surfaces_send_as_those_by_a_light_do() -> None:
+    surface, camera, far = corner(), looking_at_origin(), 1e5
+    caster, material = ray_caster(surface), made_of(surface, 0.4, (0.5,), (20.0,), bounce=0.9, gleam=0.9)
+    sent, strength = coarse_senders(surface, material), np.ones((2, 3))
+    lamps, points = Illumination(LIGHTS, strength), Illumination(position=far * LIGHTS, strength=far**2 * strength)
+
+    def shown(light: Illumination, senders: Senders | None) -> NDArray[np.float32]:
+        return rendered(caster, material, camera, light, ["image"], senders)[0]["image"]
+
+    by_points = shown(points, sent)
+    assert np.abs(by_points - shown(lamps, sent)).mean() < 1e-3 * by_points.mean()
+    assert (by_points - shown(points, None)).max() > 0.02
 
 
 def test_lobes_count_where_they_return_a_quarter() -> None:
