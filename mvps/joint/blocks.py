@@ -15,7 +15,7 @@ with D_x = 1 + g (1 - n.x)^p (shading.py) and G the light that other surfaces se
 
 Objective 1/2 sum w rho(I - image), rho Cauchy's with a scale s per vertex, the standard deviation of its weighted residuals. What lobes
 send, u = e y (a G_1 + sum_k w_k G_2+k), hangs on shapes that are not yet right, their normals above all: it adds u^2 to a sample's
-variance s^2 (LOBES_ERROR), so that samples that surfaces light directly say what normals are.
+variance s^2 (LOBES_ERROR), so that samples of light that comes straight from the lamps say what normals are.
 Every block is Gauss-Newton: normal equations are accumulated over batches of pairs, never a Jacobian as a whole, and add up over views.
 Batches are single-threaded and views are dealt to threads: torch's own threads would meet at a barrier after every one of some thirty
 small operations.

@@ -70,7 +70,7 @@ def refine_view(
         surface = integrated(maps.normal, maps.confidence)
         if state is None:
             state = State(surface, lights, (maps,), law, model)
-        state.surface, state.lights, state.maps, state.patches = surface, lights, (maps,), {}
+        state.surface, state.lights, state.maps, state.gathers = surface, lights, (maps,), {}
         task = Task(settings.free_lights, False, False, False, False, device)
         changes = photometric_round(state, capture, task, carried, generator)
         assert state.vertices is not None

@@ -52,7 +52,7 @@ common (patches.py); ties of single normals hold lights to the mesh's errors."""
 @dataclass
 class State:
     """What one round hands to the next. under: the photographs, perhaps thinned, that `views` are samples of, and their lights; lobed:
-    whether lobes take part in inter-reflection (gleam.py); patches: what sends light on, without lobes and with them, once asked for."""
+    whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and with them, once asked for."""
 
     surface: Surface
     lights: Lights
@@ -60,7 +60,7 @@ class State:
     law: Law
     model: Model
     vertices: Vertices | None = None
-    patches: dict[bool, Gather] = field(default_factory=dict)
+    gathers: dict[bool, Gather] = field(default_factory=dict)
     lobed: bool = False
     views: list[ViewSamples] = field(default_factory=list)
     under: tuple[Capture, Lights] | None = None
@@ -245,10 +245,10 @@ def _senders(state: State, vertices: Vertices) -> Senders | None:
     """What sends light on, by the vertices' reflectance; None where inter-reflection is not modelled."""
     if not (state.model.bounce or state.lobed):
         return None
-    if state.lobed not in state.patches:
-        state.patches[state.lobed] = patches_of(state.surface, state.lobed)
+    if state.lobed not in state.gathers:
+        state.gathers[state.lobed] = patches_of(state.surface, state.lobed)
     albedo, weight = _reflectance(vertices)
-    return senders(state.patches[state.lobed], state.surface, state.law, albedo, weight if state.lobed else None)
+    return senders(state.gathers[state.lobed], state.surface, state.law, albedo, weight if state.lobed else None)
 
 
 def _lit(state: State, views: list[ViewSamples], of: Capture, lights: Lights, sent: Senders | None) -> list[ViewSamples]:
