@@ -40,11 +40,13 @@ def photographed(scene: SphereScene) -> tuple[list[ViewSamples], Vertices, list[
     return views, truth, lights
 
 
-def stated_deg(scene: SphereScene, views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights]) -> Float:
+def stated_deg(
+    scene: SphereScene, views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], finer: bool = False
+) -> Float:
     """Stated standard deviations, degrees, infinite where nothing is known."""
     observed = Observed(scene.capture, scene.reconstruction.surface, views, vertices, lights, LAMBERT)
     with np.errstate(divide="ignore"):
-        return np.degrees(RELIABLE * np.sqrt(1 / stated_confidence(observed, 0.3) - 1))
+        return np.degrees(RELIABLE * np.sqrt(1 / stated_confidence(observed, 0.3, finer) - 1))
 
 
 def solved(views: list[ViewSamples], truth: Vertices, lights: list[DirectionalLights]) -> Vertices:
@@ -130,3 +132,6 @@ def test_detail_at_the_edges_stands_for_detail_below_them(scene: SphereScene) ->
     shown = np.degrees((turned.normal - truth.normal).norm(dim=1).numpy()) / np.sqrt(2)
     assert 0.5 < stated[1] / np.sqrt((shown**2).mean()) < 2
     assert stated[0] < 0.3 * stated[1]
+    # A finer mesh has it.
+    within = stated_deg(made, noisy, vertices, lights, finer=True)
+    assert np.sqrt((within[np.isfinite(within)] ** 2).mean()) < 0.3 * stated[1]

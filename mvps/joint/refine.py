@@ -249,7 +249,7 @@ def refine(
     return replace(result, surface=finer.surface, material=material, unexplained=unexplained)
 
 
-def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Material:
+def _coloured(state: State, settings: RefineSettings, generator: np.random.Generator) -> Material:
     """The material with albedo and lobes in the photographs' colours, a neural residual, if allowed, where that helps, and the stated
     error."""
     observed, lights = _observed(state)
@@ -260,10 +260,10 @@ def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Mat
         coloured_lobes = state.trials[-1].kept
     albedo, tint = colours(observed, ratios, coloured_lobes)
     residual = None
-    if neural:
+    if settings.model.neural:
         trial, residual = neural_residual(observed, relative_residuals(observed.views, observed.vertices), POOR_FIT, generator)
         state.trials.append(trial)
-    certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE), 0)
+    certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE, settings.detail), 0)
     material = replace(material_of(state, albedo), confidence=certain, residual=residual)
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 
@@ -271,7 +271,7 @@ def _coloured(state: State, neural: bool, generator: np.random.Generator) -> Mat
 def finished(state: State, settings: RefineSettings, account: list[dict[str, float]], generator: np.random.Generator) -> Refined:
     """What the rounds came to; in colour if that is final."""
     assert state.vertices is not None
-    material = _coloured(state, settings.model.neural, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
+    material = _coloured(state, settings, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
     status, text = _settled(account)
     unexplained = relative_residuals(state.views, state.vertices).double().cpu().numpy()
     return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text, unexplained)

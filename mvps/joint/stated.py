@@ -47,8 +47,9 @@ def icosahedron() -> Float:
     return normalise(corners)
 
 
-def stated_confidence(of: Observed, tie: float) -> Float:
-    """(V,) confidence (scene.py) in the vertices' normals as those of the surface; 0 without samples. tie: radians."""
+def stated_confidence(of: Observed, tie: float, finer: bool = False) -> Float:
+    """(V,) confidence (scene.py) in the vertices' normals as those of the surface; 0 without samples. tie: radians. finer: the result's
+    mesh has what photographs show below these edges (detail.py), so that nothing is added for it."""
     hands = min(WORKERS, len(of.views))
     parts = on_cores(lambda k: _sums(of.views[k::hands], of.vertices, of.lights[k::hands], of.law), range(hands))
     hessian, meat, of_kinds, squares, count = (sum(of_hands[1:], of_hands[0]) for of_hands in zip(*parts, strict=True))
@@ -65,7 +66,7 @@ def stated_confidence(of: Observed, tie: float) -> Float:
     terms = torch.stack([variance, away.square().sum(1) / 2, *_bands(of.vertices.normal, seen, noise, ends)], 1)
     variance, apart, edge, coarse = _averaged(terms, seen, ends).unbind(1)
     edge = edge.clamp_min(0)
-    detail = edge * (edge / coarse.clamp_min(1e-12)).clamp_max(1)
+    detail = 0.0 if finer else edge * (edge / coarse.clamp_min(1e-12)).clamp_max(1)
     sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail).sqrt()
     return torch.where(seen, confidence_of(sigma), 0.0).double().cpu().numpy()
 
