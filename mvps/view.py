@@ -1,8 +1,9 @@
 """python -m mvps.view RESULT: a page in the browser with the model, to turn and to light, with exact shadows.
 
 The page is the viewer of viewer/ served from this machine alone; for every light that the mouse asks for, Embree traces which vertices it
-reaches, and so for the lights that stand for an environment: one of viewer/environments.py, or a file (--envmap). With --capture the
-photographs stand beside: one is chosen, and the model takes its camera and its light.
+reaches, and so for the lights that stand for an environment: one of viewer/environments.py, or a file (--envmap). Once all is at rest it is
+traced ray by ray, with inter-reflection (viewer/picture.py). With --capture the photographs stand beside: one is chosen, and the model
+takes its camera and its light.
 """
 
 from __future__ import annotations
@@ -28,9 +29,6 @@ if TYPE_CHECKING:
 
 Answer = tuple[str, bytes]
 """A type of content, and the content."""
-
-ENVIRONMENT_LIGHTS = 32
-"""Directional lights that stand for an environment: as many as a number of the graphics processor has bits."""
 
 
 class Model:
@@ -123,16 +121,29 @@ class Model:
         such environment."""
         import numpy as np
 
-        from mvps.illumination import environment_lights
+        from mvps.viewer.picture import surroundings
 
         asked = parse_qs(query)
         name, turn = (asked.get("of") or [""])[0], (asked.get("turn") or ["0"])[0]
-        if name not in self._environments or not turn.removeprefix("-").isdecimal():
-            raise CaptureError(f"of: wanted one of {', '.join(self._environments)} and a turn in whole degrees, given {query!r}")
-        light = environment_lights(self._environments[name], ENVIRONMENT_LIGHTS, self._up, int(turn) % 360)
+        if not turn.removeprefix("-").isdecimal():
+            raise CaptureError(f"turn: wanted whole degrees, given {query!r}")
+        light = surroundings(self._environments, name, int(turn), self._up)
         lights = np.column_stack([light.direction, light.intensity, light.spread]).astype("<f4")
         reached = ~self._hidden(light.direction) @ (1 << np.arange(len(lights), dtype=np.uint32))
         return "application/octet-stream", lights.tobytes() + reached.astype("<u4").tobytes()
+
+    def picture(self, query: str) -> Answer:
+        """The PNG of ?scene={...}, what the page shows (viewer/picture.py), ray by ray. CaptureError where that is no scene."""
+        from mvps.illumination import Illumination
+        from mvps.rendering import light_senders
+        from mvps.texture import png_bytes
+        from mvps.viewer.picture import asked, picture, surroundings
+
+        scene = asked((parse_qs(query).get("scene") or [""])[0])
+        around = surroundings(self._environments, scene.environment, scene.turn, self._up) if scene.environment else Illumination()
+        surface, material = self._result.surface, self._result.material
+        shown = picture(self._caster, material, light_senders(surface, material), scene, around)
+        return "image/png", png_bytes(shown)
 
     def photograph(self, query: str) -> Answer:
         """A photograph, ?of=view_04/7, as a JPEG for the screen. CaptureError where there is none."""
@@ -157,6 +168,7 @@ def server(model: Model, port: int) -> ThreadingHTTPServer:
         "/": model.page,
         "/shadow": model.shadow,
         "/environment": model.environment,
+        "/picture": model.picture,
         "/photograph": model.photograph,
     }
 

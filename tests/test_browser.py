@@ -134,11 +134,23 @@ def test_the_report_shows_the_model_without_a_server(
     assert not said
 
 
+def traced_over(page: Any, scene: SphereScene) -> None:
+    """What rests is traced ray by ray, and shows what the graphics processor shows: where the whole ball is lit they hardly differ."""
+    page.wait_for_function("!document.getElementById('viewer-exact').hidden", timeout=60_000)
+    drawn = shown(page)
+    page.evaluate("document.getElementById('viewer-exact').style.visibility = 'visible'")
+    traced = shown(page)
+    page.evaluate("document.getElementById('viewer-exact').style.visibility = 'hidden'")
+    difference = np.abs(traced - drawn).max(axis=-1)
+    assert 0 < difference.mean() < 2 and np.quantile(difference, 0.9) < 4
+
+
 def test_the_server_s_page_has_exact_shadows_and_photographs(scene: SphereScene, opened: Opened) -> None:
     with server(Model(scene.reconstruction, scene.capture), 0) as serving:
         threading.Thread(target=serving.serve_forever, daemon=True).start()
         page, said = opened(f"http://127.0.0.1:{serving.server_port}/")
         page.wait_for_function("Number(document.getElementById('viewer').dataset.traced || 0) > 0")
+        page.evaluate("document.getElementById('viewer-exact').style.visibility = 'hidden'")
         first = shown(page)
         page.select_option("#photograph", index=15)
         page.wait_for_function("document.getElementById('beside').naturalWidth > 0")
@@ -151,5 +163,9 @@ def test_the_server_s_page_has_exact_shadows_and_photographs(scene: SphereScene,
         page.locator("#viewer-turn").fill("180")
         page.wait_for_function("Number(document.getElementById('viewer').dataset.surrounded || 0) > 1")
         assert np.abs(shown(page) - around).mean() > 1
+        traced_over(page, scene)
+        page.evaluate("window.mvpsViewer.lightFrom([0, 0, 1])")
+        assert page.locator("#viewer-exact").get_attribute("hidden") is not None, "what it showed is no longer so"
+        traced_over(page, scene)
         serving.shutdown()
     assert not said

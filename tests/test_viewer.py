@@ -10,9 +10,12 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.error import HTTPError
+from urllib.parse import urlencode
 from urllib.request import urlopen
 
+import cv2
 import numpy as np
 import pytest
 from sphere_scene import SphereScene, make_sphere
@@ -20,10 +23,14 @@ from sphere_scene import SphereScene, make_sphere
 import mvps.viewer
 from mvps.command import run
 from mvps.export import write_reconstruction
-from mvps.illumination import environment_lights
+from mvps.illumination import Illumination, environment_lights
+from mvps.layers import rendered
+from mvps.pbr import srgb_bytes
 from mvps.view import Model, main, server
 from mvps.viewer import packed, viewer_html
 from mvps.viewer.environments import MADE, made
+from mvps.viewpoints import look_at
+from mvps.visibility import RayCaster
 
 UP, FROM = np.array([0.0, 0, 1]), np.array([1.0, 0, 0])
 
@@ -111,6 +118,74 @@ def test_the_server_traces_environments(address: str, scene: SphereScene) -> Non
     assert np.allclose(first @ up, turned @ up, atol=1e-5) and np.abs(first - turned).max() > 0.5
 
 
+SCENE: dict[str, Any] = {
+    "eye": [60.0, 0, 0],
+    "forward": [-1.0, 0, 0],
+    "above": [0.0, 0, 1],
+    "focal": [90.0, 90],
+    "middle": [32.0, 24],
+    "size": [64, 48],
+    "layer": "image",
+    "lights": [{"direction": [1.0, 1, 1], "colour": [1, 0.5, 0.25]}, {"direction": [0, 0, 2.0], "colour": [1, 1, 1]}],
+    "fill": 0.0,
+    "environment": "",
+    "turn": 0,
+    "exposure": 1.5,
+}
+
+
+def pictured(address: str, **changed: Any) -> np.ndarray:
+    """(48, 64, 3) red, green, blue of the scene."""
+    data = urlopen(f"{address}/picture?" + urlencode({"scene": json.dumps(SCENE | changed)})).read()
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)[..., ::-1].astype(float)
+
+
+def test_the_server_traces_what_the_page_shows(address: str, scene: SphereScene) -> None:
+    """The picture of mvps.render under the same camera and lights, before the page's grey."""
+    r = scene.reconstruction
+    camera = look_at(np.array([60.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 64, 48, 2 * np.degrees(np.arctan(24 / 90)))
+    directions = np.array([[1.0, 1, 1], [0, 0, 1]]) / np.array([[np.sqrt(3)], [1]])
+    light = Illumination(directions, np.array([[1, 0.5, 0.25], [1, 1, 1]]))
+    found, coverage = rendered(RayCaster(r.surface), r.material, camera, light, ["image"])
+    image = pictured(address)
+    inside, outside = coverage == 1, coverage == 0
+    assert inside.sum() > 200 and (image[outside] == 33).all()
+    np.testing.assert_allclose(image[inside], srgb_bytes(1.5 * found["image"])[inside], atol=1.01)
+
+
+def test_a_lamp_at_the_eye_and_an_environment_add_light(address: str) -> None:
+    bare = pictured(address)
+    filled, around = pictured(address, fill=0.5), pictured(address, environment="white.hdr")
+    assert (filled >= bare).all() and filled.mean() > bare.mean() + 2
+    assert (around >= bare - 1).all() and around.mean() > bare.mean() + 2
+    assert np.abs(pictured(address, layer="specular") - bare).mean() > 2
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"eye": [0, 0]},
+        {"eye": [float("nan"), 0, 0]},
+        {"forward": [0, 0, 0]},
+        {"above": [1, 0, 0]},
+        {"size": [64, 100000]},
+        {"size": 3},
+        {"focal": [0, 0]},
+        {"layer": "secrets"},
+        {"lights": [{"direction": [0, 0, 0], "colour": [1, 1, 1]}]},
+        {"lights": [{"direction": [0, 0, 1]}]},
+        {"fill": -1},
+        {"exposure": float("inf")},
+        {"environment": "nowhere"},
+        {"turn": "x"},
+    ],
+)
+def test_no_scene_is_refused(address: str, changed: dict[str, Any]) -> None:
+    with pytest.raises(HTTPError) as refused:
+        pictured(address, **changed)
+    assert refused.value.code == 400
+
+
 @pytest.mark.parametrize("name", MADE)
 def test_environments_without_a_file(name: str) -> None:
     """Not negative, and of mean radiance 1 over the sphere."""
@@ -124,6 +199,8 @@ def test_environments_without_a_file(name: str) -> None:
     [
         ("/environment?of=nowhere", 400),
         ("/environment?of=window&turn=x", 400),
+        ("/picture", 400),
+        ("/picture?scene=[1,2]", 400),
         ("/shadow?light=0,0,0", 400),
         ("/shadow?light=x", 400),
         ("/shadow", 400),

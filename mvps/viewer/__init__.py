@@ -4,9 +4,9 @@ The browser's graphics processor evaluates the same image model (shading.py) for
 
     radiance = sum over lights of  E visibility (albedo D(n . l) D(n . v) + gain sum_k weight_k exp(sharpness_k (h . n - 1))) max(n . l, 0),
 
-with normal, albedo and weights interpolated between vertices. Visibility comes from who shows the page: exactly, traced by Embree for every
-vertex (mvps.view), or from a picture of depths as each light sees them (a page without a server). An environment, which only mvps.view has,
-is up to 32 directional lights (illumination.py) whose sum is evaluated at the vertices.
+with normal, albedo and weights interpolated between vertices. Visibility comes from who shows the page: traced by Embree for every vertex
+(mvps.view), or from a picture of depths as each light sees them (a page without a server). An environment, which only mvps.view has, is up
+to 32 directional lights (illumination.py) whose sum is evaluated at the vertices. What rests, mvps.view traces pixel by pixel (picture.py).
 
 Data, one array after the other, compressed by deflate (RFC 1950), written in base64:
 
@@ -128,6 +128,7 @@ def viewer_html(
     return (
         '<div class="viewer"><canvas id="viewer" tabindex="0" aria-label="The model: drag to turn it, drag with the right button or'
         ' with Shift to move the light, scroll to come closer; arrow keys turn it, with Shift they move the light"></canvas>'
+        + ('<img id="viewer-exact" alt="" hidden>' if served else "")
         + _controls(environments)
         + '<p id="viewer-said" role="status"></p></div>\n'
         f'<script type="application/json" id="viewer-about">{json.dumps(about)}</script>\n'
@@ -138,6 +139,7 @@ def viewer_html(
 
 STYLE = (
     ".viewer canvas{width:100%;max-width:48rem;aspect-ratio:4/3;background:#222;touch-action:none;display:block;cursor:grab}"
+    ".viewer{position:relative}#viewer-exact{position:absolute;top:0;left:0;width:100%;max-width:48rem;aspect-ratio:4/3;pointer-events:none}"
     ".viewer-controls label{margin-right:1.2em;white-space:nowrap}"
     ".beside{display:flex;flex-wrap:wrap;gap:1rem}.beside>div{flex:1 1 20rem;min-width:0}"
 )

@@ -2,7 +2,7 @@
 "use strict";
 (async () => {
   const byId = (name) => document.getElementById(name);
-  const canvas = byId("viewer"), said = byId("viewer-said");
+  const canvas = byId("viewer"), exact = byId("viewer-exact"), said = byId("viewer-said");
   const about = JSON.parse(byId("viewer-about").textContent);
   const gl = canvas.getContext("webgl2", { antialias: true });
   if (!gl) { said.textContent = "This browser has no WebGL 2, which the viewer needs."; return; }
@@ -89,7 +89,7 @@
     precision highp float; precision highp int; precision highp sampler2DArrayShadow;
     in vec3 x, n, rho, surrounding; in vec4 w, seen; in float certain;
     uniform vec3 eye, light[${MOST}], lamp[${MOST}]; uniform int lights;
-    uniform float exposure, fill; uniform vec2 range; uniform bool traced; uniform mat4 fromLight[${MOST}]; uniform sampler2DArrayShadow depths;
+    uniform float exposure, fill, away; uniform vec2 range; uniform bool traced; uniform mat4 fromLight[${MOST}]; uniform sampler2DArrayShadow depths;
     out vec4 colour;
     ${MODEL}
     float visibility(int k) {
@@ -115,7 +115,7 @@
         colour = vec4(vec3(free / float(lights)), 1.0);
         return;
       }
-      vec3 shown = surrounding + fill * lit(body, w, N, v, v, 0.0);
+      vec3 shown = surrounding + fill * away * away / dot(eye - x, eye - x) * lit(body, w, N, v, v, 0.0);
       for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, N, v, light[k], 0.0) * visibility(k);
       colour = vec4(srgb(shown * exposure), 1.0);
     }`;
@@ -173,6 +173,20 @@
 
   // ---- drawing ----
   let sky = [];
+  // In pixels of the canvas: focal lengths and where the axis meets the picture.
+  const seenBy = (across, down) => {
+    if (!camera) {
+      const focal = Math.min(across, down) / 2 / Math.tan(0.26);
+      return { eye: add(centre, from, distance), forward: from.map((x) => -x), above: up, focal: [focal, focal], middle: [across / 2, down / 2] };
+    }
+    // The whole photograph fits into the canvas.
+    const scale = Math.min(down / camera.size[1], across / camera.size[0]), half = [across / 2, down / 2];
+    return {
+      eye: camera.eye, forward: camera.forward, above: camera.above, focal: camera.focal.map((f) => scale * f),
+      middle: half.map((h, i) => h + scale * (camera.middle[i] - camera.size[i] / 2)),
+    };
+  };
+  const exposure = () => 2 ** Number(byId("viewer-exposure").value) / about.white / 1.5;
   const common = (program, view) => {
     gl.useProgram(program);
     set(program, "low", "3fv", about.low);
@@ -201,23 +215,15 @@
       });
       gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     }
-    const eye = camera ? camera.eye : add(centre, from, distance), away = camera ? Math.hypot(...add(eye, centre, -1)) : distance;
+    const { eye, forward, above, focal, middle } = seenBy(across, down);
+    const away = Math.hypot(...add(eye, centre, -1));
     const near = Math.max(away - 1.1 * radius, 0.01 * radius), far = away + 1.1 * radius;
-    const focal = 1 / Math.tan(0.26), aspect = across / down;
-    const lens = [focal / Math.max(aspect, 1), 0, 0, 0, 0, focal * Math.min(aspect, 1), 0, 0, 0, 0, -(far + near) / (far - near), -1, 0, 0, -2 * far * near / (far - near), 0];
-    if (aspect >= 1) { lens[0] = focal / aspect; lens[5] = focal; }
-    if (camera) {
-      // The whole photograph fits into the canvas: so many canvas halves to a pixel.
-      const wide = 2 / Math.max(camera.size[1] * aspect, camera.size[0]), high = wide * aspect;
-      lens[0] = wide * camera.focal[0];
-      lens[5] = high * camera.focal[1];
-      lens[8] = -wide * (camera.middle[0] - camera.size[0] / 2);
-      lens[9] = high * (camera.middle[1] - camera.size[1] / 2);
-    }
+    const lens = [2 * focal[0] / across, 0, 0, 0, 0, 2 * focal[1] / down, 0, 0, 1 - 2 * middle[0] / across, 2 * middle[1] / down - 1,
+      -(far + near) / (far - near), -1, 0, 0, -2 * far * near / (far - near), 0];
     gl.viewport(0, 0, across, down);
     gl.clearColor(0.13, 0.13, 0.13, 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    common(shown, product(lens, camera ? looking(eye, camera.forward, camera.above) : looking(eye, from.map((x) => -x), up)));
+    common(shown, product(lens, looking(eye, forward, above)));
     set(shown, "eye", "3fv", eye);
     set(shown, "light", "3fv", lights.flatMap((light) => light.direction));
     set(shown, "lamp", "3fv", lights.flatMap((light) => light.colour));
@@ -233,7 +239,8 @@
     set(shown, "lobeWhite", "4fv", about.lobe_white);
     set(shown, "white", "1f", about.white);
     set(shown, "grazing", "1f", about.grazing);
-    set(shown, "exposure", "1f", 2 ** Number(byId("viewer-exposure").value) / about.white / 1.5);
+    set(shown, "exposure", "1f", exposure());
+    set(shown, "away", "1f", away);
     set(shown, "range", "2f", away - radius, away + radius);
     set(shown, "fill", "1f", Number(byId("viewer-fill").value));
     set(shown, "layer", "1i", byId("viewer-layer").selectedIndex);
@@ -243,9 +250,11 @@
     set(shown, "depths", "1i", 0);
     gl.drawElements(gl.TRIANGLES, 3 * F, gl.UNSIGNED_INT, 0);
     canvas.dataset.drawn = String(Number(canvas.dataset.drawn || 0) + 1);
+    rest();
   };
   let waiting = false;
   const later = () => {
+    exact?.setAttribute("hidden", "");
     if (waiting) return;
     waiting = true;
     requestAnimationFrame(() => { waiting = false; draw(); });
@@ -278,6 +287,34 @@
         later();
       }
     } finally { asking = false; }
+  };
+  // Once nothing has changed for REST milliseconds: the same picture, ray by ray, over the canvas. One at a time is asked for.
+  const REST = 400, LAYERS = { 0: "image", 2: "specular" };
+  let resting = 0, tracing = false;
+  const trace = async () => {
+    const layer = LAYERS[byId("viewer-layer").selectedIndex];
+    if (tracing || !layer || stale.size || asking) return;
+    tracing = true;
+    const then = canvas.dataset.drawn, size = [canvas.width, canvas.height];
+    const scene = {
+      ...seenBy(...size), size, layer, lights: lights.map(({ direction, colour }) => ({ direction, colour })),
+      fill: Number(byId("viewer-fill").value), environment: byId("viewer-environment").value, turn: Number(byId("viewer-turn").value), exposure: exposure(),
+    };
+    try {
+      const picture = new Blob([await bytesOf("picture?scene=" + encodeURIComponent(JSON.stringify(scene)))], { type: "image/png" });
+      URL.revokeObjectURL(exact.src);
+      exact.src = URL.createObjectURL(picture);
+      await exact.decode();
+      exact.hidden = waiting || then !== canvas.dataset.drawn;
+    } finally {
+      tracing = false;
+      if (then !== canvas.dataset.drawn) rest();
+    }
+  };
+  const rest = () => {
+    if (!about.served) return;
+    clearTimeout(resting);
+    resting = setTimeout(() => trace().catch(failed), REST);
   };
   let surrounding = 0;
   const surround = async () => {
