@@ -173,15 +173,17 @@ def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) 
     from gpytoolbox import remesh_botsch
 
     vertices: Any
-    vertices, faces = remesh_botsch(
-        np.array(surface.vertices),
-        np.array(surface.faces, dtype=np.int32),
-        i=iterations,
-        h=edge_length,
-        project=True,
-        detect_feature_edges=True,
-        feature_dihedral_threshold=KNIFE_EDGE,
-    )
+    # A face without area has no normal, and its edges are no knife's.
+    with np.errstate(invalid="ignore"):
+        vertices, faces = remesh_botsch(
+            np.array(surface.vertices),
+            np.array(surface.faces, dtype=np.int32),
+            i=iterations,
+            h=edge_length,
+            project=True,
+            detect_feature_edges=True,
+            feature_dihedral_threshold=KNIFE_EDGE,
+        )
     return largest_component(Surface(vertices, faces))
 
 

@@ -5,10 +5,11 @@ inter-reflection, a position that is off) is shared by the samples of one view, 
 equations, s its residuals' scale and g_c the part of the gradient that comes from view or light c, the errors of the unknowns have the
 covariance
 
-    H^-1 (s^2 H + sum_views g_c g_c^T + sum_lights g_c g_c^T) H^-1
+    H^-1 (sum_views g_c g_c^T + sum_lights g_c g_c^T) H^-1,   at least   s^2 H^-1
 
-(sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011). Lights nearest to the same of
-twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Then, no surface has the
+(sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011, who take what noise alone does,
+which both sums hold, off once: here it stays, because kinds of errors that neither sum knows would rather have more). Lights nearest to the
+same of twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Then, no surface has the
 normals n of all vertices: fused positions keep only what is integrable of them, and of an error without any pattern half is. So how far n
 is from the normal m of the surface is one more sign of error. Last, a surface goes on between its vertices. The mean M over neighbours
 takes apart what normals show at the length of an edge, D = |n - M n|^2 / 2, and at twice that, C = |M n - M^4 n|^2 / 2, both beyond what
@@ -54,14 +55,15 @@ def stated_confidence(of: Observed, tie: float, finer: bool = False) -> Float:
     parts = on_cores(lambda k: _sums(of.views[k::hands], of.vertices, of.lights[k::hands], of.law), range(hands))
     hessian, meat, of_kinds, squares, count = (sum(of_hands[1:], of_hands[0]) for of_hands in zip(*parts, strict=True))
     scale = squares / count.clamp_min(torch.finfo(squares.dtype).tiny)
-    meat = meat + of_kinds.transpose(1, 2) @ of_kinds + scale[:, None, None] * hessian
+    meat = meat + of_kinds.transpose(1, 2) @ of_kinds
     bread = columns_of_inverse(hessian, 2)
-    variance = (bread * (meat @ bread)).sum((1, 2)) / 2
+    noise = scale * (bread[:, 0, 0] + bread[:, 1, 1]) / 2
+    variance = torch.maximum((bread * (meat @ bread)).sum((1, 2)) / 2, noise)
     seen = (count > 0) & (variance > 0)
     # A camera sees no two normals that are further apart than a radian or so.
     variance = torch.where(seen, variance.clamp(1e-12, 1.0), 0.0)
     away = of.vertices.normal - torch.tensor(vertex_normals(of.surface)).to(of.vertices.normal)
-    noise = torch.where(seen, scale * (bread[:, 0, 0] + bread[:, 1, 1]) / 2, 0.0)
+    noise = torch.where(seen, noise, 0.0)
     ends = torch.from_numpy(edges(of.surface)).to(seen.device)
     terms = torch.stack([variance, away.square().sum(1) / 2, *_bands(of.vertices.normal, seen, noise, ends)], 1)
     variance, apart, edge, coarse = _averaged(terms, seen, ends).unbind(1)
