@@ -134,7 +134,7 @@ def test_the_report_shows_the_model_without_a_server(
     assert not said
 
 
-def traced_over(page: Any, scene: SphereScene) -> None:
+def traced_over(page: Any) -> None:
     """What rests is traced ray by ray, and shows what the graphics processor shows: where the whole ball is lit they hardly differ."""
     page.wait_for_function("!document.getElementById('viewer-exact').hidden", timeout=60_000)
     drawn = shown(page)
@@ -163,9 +163,9 @@ def test_the_server_s_page_has_exact_shadows_and_photographs(scene: SphereScene,
         page.locator("#viewer-turn").fill("180")
         page.wait_for_function("Number(document.getElementById('viewer').dataset.surrounded || 0) > 1")
         assert np.abs(shown(page) - around).mean() > 1
-        traced_over(page, scene)
+        traced_over(page)
         page.evaluate("window.mvpsViewer.lightFrom([0, 0, 1])")
         assert page.locator("#viewer-exact").get_attribute("hidden") is not None, "what it showed is no longer so"
-        traced_over(page, scene)
+        traced_over(page)
         serving.shutdown()
     assert not said

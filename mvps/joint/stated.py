@@ -8,8 +8,8 @@ covariance
     H^-1 (sum_views g_c g_c^T + sum_lights g_c g_c^T) H^-1,   at least   s^2 H^-1
 
 (sandwich estimator for clustered samples, Liang and Zeger 1986; clusters of two kinds, Cameron et al. 2011, who take what noise alone does,
-which both sums hold, off once: here it stays, because kinds of errors that neither sum knows would rather have more). Lights nearest to the
-same of twelve directions, an icosahedron's corners, count as one: a turntable's rig is elsewhere in every view. Then, no surface has the
+which both sums hold, off once: here it stays). Lights nearest to the same of twelve directions, an icosahedron's corners, count as one: a
+turntable's rig is elsewhere in every view. Then, no surface has the
 normals n of all vertices: fused positions keep only what is integrable of them, and of an error without any pattern half is. So how far n
 is from the normal m of the surface is one more sign of error. Last, a surface goes on between its vertices. The mean M over neighbours
 takes apart what normals show at the length of an edge, D = |n - M n|^2 / 2, and at twice that, C = |M n - M^4 n|^2 / 2, both beyond what
@@ -19,7 +19,8 @@ the surface is smooth. Of each tangential component
     sigma^2 = 1 / (1 / sigma_samples^2 + 1 / tie^2) + |n - m|^2 / 2 + D min(D / C, 1)
 
 where the tie to the mesh stands in where samples say little. A vertex has few clusters, so its figures are averaged with its neighbours'.
-No constant is fitted to true normals; the last term's form was chosen with true normals in view (docs/method.md).
+No constant is fitted to true normals; that noise stays in both sums, and the last term's form, were chosen with true normals in view
+(docs/method.md).
 """
 
 from __future__ import annotations
