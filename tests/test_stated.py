@@ -71,7 +71,8 @@ def of_view(samples: ViewSamples, draw: torch.Generator) -> torch.Tensor:
 @pytest.mark.parametrize(("error", "most"), [(independent, 2.5), (of_view, 3.0)])
 def test_stated_errors_are_no_smaller_than_those_that_come_out(scene: SphereScene, error: Callable[..., torch.Tensor], most: float) -> None:
     """They err on the safe side. Where samples share nothing, the sums over views and lights and what the surface contradicts each say the
-    whole error: 1.7 times as large (1.4 to 2.0 in quarters). Slopes of views partly cancel in a view but not under a light, which then says still more."""
+    whole error: 1.7 times as large (1.4 to 2.0 in quarters). Slopes of views partly cancel in a view but not under a light, which then says
+    still more."""
     views, truth, lights = photographed(scene)
     draw = torch.Generator().manual_seed(0)
     wrong = [replace(samples, image=samples.image + error(samples, draw)) for samples in views]
