@@ -221,6 +221,12 @@ def expected_error_deg(confidence: Float) -> Float:
     return error.clip(max=90.0)
 
 
+def less_confident(confidence: Float, variance: Float) -> Float:
+    """Confidence (n,) of normals that have a further variance (n,) along a tangent, radians^2; 0 stays 0."""
+    known = confidence > 0
+    return np.where(known, 1 / (1 / np.where(known, confidence, 1) + variance / RELIABLE**2), 0.0)
+
+
 @dataclass(frozen=True, eq=False)
 class NormalMap:
     """Photometric stereo of one view, at its foreground pixels.

@@ -16,11 +16,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvps.joint.bas_relief import bas_relief, turned
+from mvps.joint.bas_relief import bas_relief, relief_variance, turned
 from mvps.joint.photometry import State, Task, photometric_round
 from mvps.joint.refine import Refined, RefineSettings, finished
-from mvps.mesh import lengths
-from mvps.scene import Capture, Float, Law, Lights, NormalMap, Surface
+from mvps.mesh import edges, lengths
+from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, less_confident
 
 ROUNDS = {"draft": 1, "standard": 3, "fine": 5}
 """By preset."""
@@ -79,4 +79,27 @@ def refine_view(
         account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, "vertex_change_px": 0.0})
         on_round(number, account[-1])
     assert state is not None
-    return finished(state, settings, account, generator)
+    refined = finished(state, settings, account, generator)
+    material = replace(refined.material, confidence=with_rim(refined.material.confidence, state.surface))
+    return replace(refined, material=_leaning(material, capture, state, generator, device) if settings.free_lights else material)
+
+
+def with_rim(confidence: Float, surface: Surface) -> Float:
+    """Confidence (V,) of a surface all of which the camera sees: at the outline, where pixels show the background too and none speaks for a
+    vertex, the normal is what integration makes of its neighbours', and its variance their mean."""
+    known, ends = confidence > 0, edges(surface)
+    variance = np.where(known, 1 / np.where(known, confidence, 1) - 1, 0)
+    total, count = np.zeros((2, len(confidence)))
+    for here, there in (ends.T, ends.T[::-1]):
+        total += np.bincount(here, variance[there], len(total))
+        count += np.bincount(here, known[there], len(count))
+    beside = ~known & (count > 0)
+    return np.where(beside, 1 / (1 + total / np.maximum(count, 1)), confidence)
+
+
+def _leaning(material: Material, capture: Capture, state: State, generator: np.random.Generator, device: torch.device) -> Material:
+    """The material, confident no more than the bas-relief is known."""
+    lights, maps = state.lights, state.maps[0]
+    grey, own = maps.albedo.mean(1).astype(np.float64), (lights.direction[0], lights.intensity[0])
+    variance = relief_variance(capture.views[0], maps.normal.astype(np.float64), grey, own, state.law, generator, device)
+    return replace(material, confidence=less_confident(material.confidence, variance(material.normal)))
