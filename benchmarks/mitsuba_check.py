@@ -38,9 +38,9 @@ PIXELS, LEAST_COSINE = 200, 0.05
 """Of a view, in the comparison of lobes; cosines below which nothing is to be seen."""
 NOTE = """Direct light, 16 samples a pixel, inside the outlines of both, peak 1 (what saturates the photographs). `others off`: ours without
 inter-reflection, which glTF's direct light has not. `both lit`: of these the pixels, their share behind, that neither shows in shadow:
-our shadow rays start a fifth of an edge's length away from the mesh, Mitsuba's on it. `lobes`: relative RMS difference between our lobes and glTF's,
-and between the whole reflectances, over lit pixels and lights of all views. `tangents`: mean angle between the file's tangents and those
-that a reader makes of the texture coordinates."""
+our shadow rays start a fifth of an edge's length away from the mesh, Mitsuba's on it. `lobes`: relative RMS difference between our lobes
+and glTF's, and between the whole reflectances, over lit pixels and lights of all views. `tangents`: mean angle between the file's tangents
+and those that a reader makes of the texture coordinates."""
 
 
 class Pair(NamedTuple):

@@ -69,6 +69,18 @@ def test_a_mesh_that_is_larger_than_expected_leaves_fewer_views_or_is_refused() 
         room_for(3 * vertices)
 
 
+def test_light_by_way_of_lobes_takes_room() -> None:
+    """In grey beside the vertices, in colours when these are done."""
+    few, many = (peak_bytes(PROGRAM, SIZES, 1e5, 2, sending) - peak_bytes(PROGRAM, SIZES, 1e5, 2) for sending in (1000, 100000))
+    assert few == 2 * 96 * 1000 * memory.SENT
+    assert many == 3 * 100 * few - memory.VERTEX * 1e5
+    keep_below((peak_bytes(PROGRAM, SIZES, 1e5, 1, 100000) + 1e6) / 1e9, PROGRAM, SIZES, "draft")
+    room_for(1e5)
+    assert at_a_time() > 1
+    room_for(1e5, 100000)
+    assert at_a_time() == 1
+
+
 def test_results_come_in_order_whatever_the_number_at_a_time() -> None:
     for most in (1, 3):
         work_on(most)

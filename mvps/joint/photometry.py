@@ -32,6 +32,7 @@ from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albed
 from mvps.joint.thinned import thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose, judged
+from mvps.memory import room_for
 from mvps.mesh import angles_deg, edges, lengths, normalise, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
@@ -246,7 +247,8 @@ def _senders(state: State, vertices: Vertices) -> Senders | None:
     if not (state.model.bounce or state.lobed):
         return None
     if state.lobed not in state.gathers:
-        state.gathers[state.lobed] = patches_of(state.surface, state.lobed)
+        of = state.gathers[state.lobed] = patches_of(state.surface, state.lobed)
+        room_for(len(state.surface.vertices), len(of.normal) * state.lobed)
     albedo, weight = _reflectance(vertices)
     return senders(state.gathers[state.lobed], state.surface, state.law, albedo, weight if state.lobed else None)
 
