@@ -57,7 +57,7 @@ def photographed_outside(sample: Sample, given: Path) -> None:
             cv2.imwrite(str(path), image)
 
 
-def measured(sample: Sample, folder: Path, preset: str, limit: float = 300.0) -> Row:
+def measured(sample: Sample, folder: Path, preset: str, limit: float = 900.0) -> Row:
     """Figures, status, what the program said, seconds and peak memory of one case; its files in `folder`."""
     given, good, result = folder / "given", folder / "good", folder / "result"
     write_capture(sample.given, sample.truth, given)
@@ -175,7 +175,7 @@ def main() -> None:
     parser.add_argument("cases", nargs="*", help=" ".join(CASES))
     parser.add_argument("--honesty", type=int, default=0, metavar="N", help="run N cases by chance")
     parser.add_argument("--preset", default="standard")
-    parser.add_argument("--limit", type=float, default=300.0, metavar="S", help="seconds after which a command counts as hanging")
+    parser.add_argument("--limit", type=float, default=900.0, metavar="S", help="seconds after which a command counts as hanging")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep captures and results")
     given = parser.parse_args()
     unknown = [name for name in given.cases if name not in CASES]
