@@ -5,7 +5,13 @@ from __future__ import annotations
 import base64
 import json
 import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
 import threading
+import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -26,7 +32,7 @@ from mvps.export import write_reconstruction
 from mvps.illumination import Illumination, environment_lights
 from mvps.layers import rendered
 from mvps.pbr import srgb_bytes
-from mvps.view import Model, main, server
+from mvps.view import Model, main, named, server
 from mvps.viewer import packed, viewer_html
 from mvps.viewer.environments import MADE, made
 from mvps.viewpoints import look_at
@@ -76,7 +82,8 @@ def test_a_model_that_is_too_large_is_named(scene: SphereScene, monkeypatch: pyt
 @pytest.fixture(scope="module")
 def address(scene: SphereScene) -> Iterator[str]:
     white = np.ones((16, 32, 3), np.float32)
-    with server(Model(scene.reconstruction, scene.capture, {"white.hdr": white}), 0) as serving:
+    red = replace(scene.reconstruction.material, albedo=np.tile([0.5, 0, 0], (len(scene.reconstruction.surface.vertices), 1)))
+    with server(Model(scene.reconstruction, scene.capture, {"white.hdr": white}, {"red.json": red}), 0) as serving:
         threading.Thread(target=serving.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{serving.server_port}"
         serving.shutdown()
@@ -130,6 +137,7 @@ SCENE: dict[str, Any] = {
     "fill": 0.0,
     "environment": "",
     "turn": 0,
+    "material": "as solved",
     "exposure": 1.5,
 }
 
@@ -161,6 +169,58 @@ def test_a_lamp_at_the_eye_and_an_environment_add_light(address: str) -> None:
     assert np.abs(pictured(address, layer="specular") - bare).mean() > 2
 
 
+def test_the_server_has_other_materials(address: str, scene: SphereScene) -> None:
+    """The page starts with the edited one; all are on the same vertices."""
+    page = urlopen(f"{address}/").read().decode()
+    assert re.search(r'id="viewer-material"><option>red.json</option><option>as solved</option><option>matte</option>', page)
+    surface = scene.reconstruction.surface
+
+    def albedo(name: str) -> np.ndarray:
+        answer = json.loads(urlopen(f"{address}/material?{urlencode({'of': name})}").read())
+        V = answer["about"]["vertices"]
+        assert len(surface.vertices) == V
+        return np.frombuffer(zlib.decompress(base64.b64decode(answer["data"])), np.uint8)[12 * V : 15 * V].reshape(V, 3)
+
+    assert not albedo("red.json")[:, 1:].any() and not albedo("gold").any() and albedo("as solved").all()
+    red = pictured(address, material="red.json")
+    assert red[20:28, 28:36, 0].min() > 10 * red[20:28, 28:36, 1].mean() / 9
+    assert (pictured(address) - red)[..., 1].mean() > 2
+
+
+def test_the_layer_of_shadows_is_that_of_mvps_render(address: str, scene: SphereScene) -> None:
+    """White where another part hides the light, which none of a ball does."""
+    image = pictured(address, layer="shadow", fill=0.5, environment="white.hdr", eye=[400.0, 0, 0])
+    assert (image[24, 32] == 0).all() and (image[0, 0] == 33).all()
+
+
+def test_files_of_one_name_stay_apart() -> None:
+    found = named([Path("a/x.hdr"), Path("b/x.hdr"), Path("c/studio"), Path("y.hdr")], ["studio"])
+    assert list(found) == ["a/x.hdr", "b/x.hdr", "c/studio", "y.hdr"]
+
+
+def test_a_page_that_is_closed_is_no_error(address: str, capfd: pytest.CaptureFixture[str]) -> None:
+    host, port = address.removeprefix("http://").split(":")
+    for _ in range(3):
+        left = socket.create_connection((host, int(port)))
+        left.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        left.sendall(b"GET / HTTP/1.1\r\n\r\n")
+        left.close()
+    urlopen(f"{address}/").read()
+    time.sleep(0.5)
+    assert capfd.readouterr().err == ""
+
+
+def test_ctrl_c_ends_it(scene: SphereScene, tmp_path: Path) -> None:
+    write_reconstruction(scene.reconstruction, tmp_path / "result")
+    command = [sys.executable, "-m", "mvps.view", str(tmp_path / "result"), "--port", "0", "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        assert "http://127.0.0.1:" in running.stdout.readline()
+        running.send_signal(signal.SIGINT)
+        _, said = running.communicate(timeout=60)
+    assert (running.returncode, said) == (0, "")
+
+
 @pytest.mark.parametrize(
     "changed",
     [
@@ -178,6 +238,7 @@ def test_a_lamp_at_the_eye_and_an_environment_add_light(address: str) -> None:
         {"exposure": float("inf")},
         {"environment": "nowhere"},
         {"turn": "x"},
+        {"material": "cheese"},
     ],
 )
 def test_no_scene_is_refused(address: str, changed: dict[str, Any]) -> None:
@@ -199,12 +260,15 @@ def test_environments_without_a_file(name: str) -> None:
     [
         ("/environment?of=nowhere", 400),
         ("/environment?of=window&turn=x", 400),
+        (f"/environment?of=window&turn={'9' * 5000}", 400),
+        ("/material?of=cheese", 400),
         ("/picture", 400),
         ("/picture?scene=[1,2]", 400),
         ("/shadow?light=0,0,0", 400),
         ("/shadow?light=x", 400),
         ("/shadow", 400),
         ("/photograph?of=view_77/1", 400),
+        (f"/photograph?of=view_01/{'9' * 5000}", 400),
         ("/../etc/passwd", 404),
     ],
 )

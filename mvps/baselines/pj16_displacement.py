@@ -76,7 +76,9 @@ def _slopes(surface: Surface, along: Float, target: Float, trust: Float) -> tupl
     """Matrix (V, V) and right side (V,) of the normal equations of the faces' slopes in d."""
     faces, count = surface.faces, len(surface.vertices)
     # With the cotangent of the opposite angle, an edge i-j adds half of it times (s_i - s_j)^2 for s = height + slope d.
-    half = igl.cotmatrix_entries(np.array(surface.vertices), np.array(faces)).clip(SHARPEST, 1 / SHARPEST)
+    half = igl.cotmatrix_entries(np.array(surface.vertices), np.array(faces))
+    # A face without area has angles that are no numbers.
+    half = np.where(np.isfinite(half), half, SHARPEST).clip(SHARPEST, 1 / SHARPEST)
     scale = count / (NORMAL_SIGMA**2 * face_areas(surface).sum())
     weight = half * (scale * trust)[:, None]
     slope = np.einsum("fc,fkc->fk", target, along[faces])

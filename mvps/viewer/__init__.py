@@ -93,10 +93,10 @@ def _options(names: Sequence[str]) -> str:
     return "".join(f"<option>{escape(name)}</option>" for name in names)
 
 
-def _controls(environments: Sequence[str]) -> str:
-    around = ""
+def _controls(environments: Sequence[str], materials: Sequence[str]) -> str:
+    around = f'<label>Material <select id="viewer-material">{_options(materials)}</select></label> ' if materials else ""
     if environments:
-        around = (
+        around += (
             '<label>Environment <select id="viewer-environment"><option value="">none</option>'
             + _options(environments)
             + "</select></label> "
@@ -117,10 +117,17 @@ def _controls(environments: Sequence[str]) -> str:
 
 
 def viewer_html(
-    surface: Surface, material: Material, up: Float, looking_from: Float, served: bool = False, environments: Sequence[str] = ()
+    surface: Surface,
+    material: Material,
+    up: Float,
+    looking_from: Float,
+    served: bool = False,
+    environments: Sequence[str] = (),
+    materials: Sequence[str] = (),
 ) -> str:
     """The part of a page; up, looking_from (3,): upwards and towards the first camera, world frame. served: visibility is asked of the
-    server that the page came from, and environments, by their names. A sentence in its place where the model is too large for a page."""
+    server that the page came from, and environments and other materials, by their names; the first of these is `material`. A sentence in
+    its place where the model is too large for a page."""
     about, data = packed(surface, material)
     if len(data) > LARGEST_BYTES and not served:
         return f"<p>The model of {len(surface.vertices):,} vertices is too large for this page; model.glb shows it.</p>"
@@ -129,7 +136,7 @@ def viewer_html(
         '<div class="viewer"><canvas id="viewer" tabindex="0" aria-label="The model: drag to turn it, drag with the right button or'
         ' with Shift to move the light, scroll to come closer; arrow keys turn it, with Shift they move the light"></canvas>'
         + ('<img id="viewer-exact" alt="" hidden>' if served else "")
-        + _controls(environments)
+        + _controls(environments, materials)
         + '<p id="viewer-said" role="status"></p></div>\n'
         f'<script type="application/json" id="viewer-about">{json.dumps(about)}</script>\n'
         f'<script type="text/plain" id="viewer-data">{base64.b64encode(data).decode("ascii")}</script>\n'

@@ -4,9 +4,10 @@ The page says what it shows in one JSON object:
 
     {"eye", "forward", "above": 3 numbers each, world frame; "focal", "middle", "size": [across, down], pixels; "layer": one of LAYERS;
      "lights": [{"direction": [3], "colour": [3]}, ...]; "fill": a lamp at the eye, over the square of the object's distance;
-     "environment": a name, or ""; "turn": whole degrees; "exposure": factor before sRGB}
+     "environment": a name, or ""; "turn": whole degrees; "material": a name; "exposure": factor before sRGB}
 
-The picture is that of mvps.render (layers.py): shadows where every ray meets the surface, smooth edges, inter-reflection.
+The picture is that of mvps.render (layers.py): shadows where every ray meets the surface, smooth edges, inter-reflection. The layer of
+shadows is that of the page's own lights, 0 to 1 as grey values.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from mvps.scene import Camera, CaptureError, Float, Material
 from mvps.viewpoints import ball_around
 from mvps.visibility import RayCaster
 
-LAYERS = ("image", "specular")
+LAYERS = ("image", "specular", "shadow")
 
 LARGEST_SIDE = 4096
 """Pixels: of a screen."""
@@ -50,6 +51,7 @@ class Asked:
     fill: float
     environment: str
     turn: int
+    material: str
     exposure: float
 
 
@@ -60,7 +62,8 @@ def asked(text: str) -> Asked:
         direction, colour = (np.array([_three(one[name]) for one in said["lights"]]).reshape(-1, 3) for name in ("direction", "colour"))
         fill, turn, exposure = (float(said[name]) for name in ("fill", "turn", "exposure"))
         lights = Illumination(normalise(direction), colour)
-        found = Asked(_camera(said), str(said["layer"]), lights, fill, str(said["environment"]), int(turn), exposure)
+        around, material = str(said["environment"]), str(said["material"])
+        found = Asked(_camera(said), str(said["layer"]), lights, fill, around, int(turn), material, exposure)
         if found.layer not in LAYERS or not np.isfinite([fill, exposure]).all() or min(fill, exposure, colour.min(initial=0)) < 0:
             raise ValueError("a layer or a number that is none")
         if (lengths(direction) == 0).any():
@@ -98,12 +101,19 @@ def surroundings(environments: Mapping[str, NDArray[np.float32]], name: str, tur
 
 def picture(caster: RayCaster, material: Material, senders: Senders | None, scene: Asked, around: Illumination) -> NDArray[np.uint8]:
     """sRGB (height, width, 3) of what is asked for, under the lights around it too, before the page's background."""
+    if scene.layer == "shadow":
+        found, coverage = rendered(caster, material, scene.camera, scene.lights, ["shadow"])
+        return _before_background(255 * found["shadow"][..., None].repeat(3, axis=2), coverage)
     eye = scene.camera.centre
     away = lengths(eye - ball_around(caster.surface)[0])
     lamp = Illumination(position=eye[None], strength=np.full((1, 3), scene.fill * away**2)) if scene.fill else Illumination()
     light = scene.lights.with_also(around).with_also(lamp)
     found, coverage = rendered(caster, material, scene.camera, light, [scene.layer], senders)
+    return _before_background(srgb_bytes(found[scene.layer] * np.float32(scene.exposure)), coverage)
+
+
+def _before_background(shown: NDArray[Any], coverage: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Values of 0 to 255 (height, width, 3) where the object covers the page's background (height, width)."""
     part = coverage[..., None]
-    shown = srgb_bytes(found[scene.layer] * np.float32(scene.exposure)) * part + BACKGROUND * (1 - part)
-    pixels: NDArray[np.uint8] = np.rint(shown).astype(np.uint8)
+    pixels: NDArray[np.uint8] = np.rint(shown * part + BACKGROUND * (1 - part)).astype(np.uint8)
     return pixels

@@ -8,13 +8,15 @@
   if (!gl) { said.textContent = "This browser has no WebGL 2, which the viewer needs."; return; }
 
   // ---- data ----
-  const packed = Uint8Array.from(atob(byId("viewer-data").textContent), (c) => c.charCodeAt(0));
-  const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"));
-  const bytes = await new Response(stream).arrayBuffer();
   const V = about.vertices, F = about.faces;
-  let at = 0;
-  const take = (length) => { const part = bytes.slice(at, at + length); at += length; return part; };
-  const arrays = { position: take(6 * V), normal: take(6 * V), albedo: take(3 * V), weight: take(4 * V), confidence: take(V), faces: take(12 * F) };
+  const unpacked = async (text) => {
+    const packed = Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+    const bytes = await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+    let at = 0;
+    const take = (length) => { const part = bytes.slice(at, at + length); at += length; return part; };
+    return { position: take(6 * V), normal: take(6 * V), albedo: take(3 * V), weight: take(4 * V), confidence: take(V), faces: take(12 * F) };
+  };
+  const arrays = await unpacked(byId("viewer-data").textContent);
 
   // ---- small vectors and matrices (columns) ----
   const add = (a, b, s = 1) => a.map((x, i) => x + s * b[i]);
@@ -110,9 +112,13 @@
       if (layer == 1) { colour = vec4(srgb(body * exposure), 1.0); return; }
       if (layer == 5) { colour = vec4(vec3(1.0 - (length(eye - x) - range.x) / (range.y - range.x)), 1.0); return; }
       if (layer == 6) {
-        float free = 0.0;
-        for (int k = 0; k < lights; k++) free += dot(N, light[k]) > 0.0 ? visibility(k) : 0.0;
-        colour = vec4(vec3(free / float(lights)), 1.0);
+        float hidden = 0.0, all = 0.0;
+        for (int k = 0; k < lights; k++) {
+          float flux = max(dot(N, light[k]), 0.0) * dot(lamp[k], vec3(1.0 / 3.0));
+          all += flux;
+          hidden += flux * (1.0 - visibility(k));
+        }
+        colour = vec4(vec3(hidden / max(all, 1e-12)), 1.0);
         return;
       }
       vec3 shown = surrounding + fill * away * away / dot(eye - x, eye - x) * lit(body, w, N, v, v, 0.0);
@@ -186,7 +192,9 @@
       middle: half.map((h, i) => h + scale * (camera.middle[i] - camera.size[i] / 2)),
     };
   };
-  const exposure = () => 2 ** Number(byId("viewer-exposure").value) / about.white / 1.5;
+  // Of the material that the page came with, so that a darker one looks darker.
+  const white = about.white;
+  const exposure = () => 2 ** Number(byId("viewer-exposure").value) / white / 1.5;
   const common = (program, view) => {
     gl.useProgram(program);
     set(program, "low", "3fv", about.low);
@@ -289,7 +297,7 @@
     } finally { asking = false; }
   };
   // Once nothing has changed for REST milliseconds: the same picture, ray by ray, over the canvas. One at a time is asked for.
-  const REST = 400, LAYERS = { 0: "image", 2: "specular" };
+  const REST = 400, LAYERS = { 0: "image", 2: "specular", 6: "shadow" };
   let resting = 0, tracing = false;
   const trace = async () => {
     const layer = LAYERS[byId("viewer-layer").selectedIndex];
@@ -298,7 +306,8 @@
     const then = canvas.dataset.drawn, size = [canvas.width, canvas.height];
     const scene = {
       ...seenBy(...size), size, layer, lights: lights.map(({ direction, colour }) => ({ direction, colour })),
-      fill: Number(byId("viewer-fill").value), environment: byId("viewer-environment").value, turn: Number(byId("viewer-turn").value), exposure: exposure(),
+      fill: Number(byId("viewer-fill").value), environment: byId("viewer-environment").value, turn: Number(byId("viewer-turn").value),
+      material: byId("viewer-material").value, exposure: exposure(),
     };
     try {
       const picture = new Blob([await bytesOf("picture?scene=" + encodeURIComponent(JSON.stringify(scene)))], { type: "image/png" });
@@ -332,6 +341,23 @@
     gl.bindBuffer(gl.ARRAY_BUFFER, openBuffer);
     gl.bufferSubData(gl.ARRAY_BUFFER, 0, bits);
     canvas.dataset.surrounded = String(Number(canvas.dataset.surrounded || 0) + 1);
+    later();
+  };
+
+  // Another material on the same vertices.
+  let dressing = 0;
+  const dress = async () => {
+    const mine = ++dressing;
+    const answer = JSON.parse(new TextDecoder().decode(await bytesOf("material?of=" + encodeURIComponent(byId("viewer-material").value))));
+    const found = await unpacked(answer.data);
+    // A later choice may have been answered first.
+    if (mine !== dressing) return;
+    Object.assign(about, answer.about);
+    ["albedo", "weight"].forEach((name) => {
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffers[ATTRIBUTES.findIndex(([of]) => of === name)]);
+      gl.bufferSubData(gl.ARRAY_BUFFER, 0, found[name]);
+    });
+    canvas.dataset.dressed = String(Number(canvas.dataset.dressed || 0) + 1);
     later();
   };
 
@@ -431,11 +457,23 @@
   [tone, strength].forEach((control) => control.addEventListener("input", coloured));
   listed();
   const failed = (error) => { said.textContent = "The viewer failed: " + error.message; };
+  byId("viewer-material")?.addEventListener("change", () => dress().catch(failed));
   ["viewer-environment", "viewer-turn"].forEach((name) => byId(name)?.addEventListener("change", () => surround().catch(failed)));
   new ResizeObserver(later).observe(canvas);
   window.mvpsViewer = {
     look: (through) => { camera = through; from = through.forward.map((x) => -x); later(); },
-    lightFrom: (direction) => { lights[chosen].direction = unit(direction); ask(chosen).catch(failed); later(); },
+    // The only light, as it was when a photograph was taken.
+    lightFrom: (direction, colour) => {
+      const most = Math.max(...colour, 1e-12), code = (c) => Math.round(255 * (c <= 0.0031308 ? 12.92 * c : 1.055 * c ** (1 / 2.4) - 0.055));
+      const tone = "#" + colour.map((c) => code(c / most).toString(16).padStart(2, "0")).join("");
+      lights.splice(0, lights.length, { direction: unit(direction), colour, tone, strength: most });
+      chosen = 0;
+      byId("viewer-fill").value = "0";
+      listed();
+      if (byId("viewer-environment").value) { byId("viewer-environment").value = ""; surround().catch(failed); }
+      ask(0).catch(failed);
+      later();
+    },
   };
   ask(0).catch(failed);
   later();
