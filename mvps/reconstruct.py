@@ -162,7 +162,8 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
         density = TEXELS_PER_PIXEL[settings.preset]
         surface = reconstruction.surface
         shells = {faces: shell for faces in settings.faces if (shell := decimated(surface, faces)) is not None}
-        textures, *levels = bake(surface, reconstruction.material, lights, part, density, tuple(shells.values()))
+        maps = [reconstruction.normal_maps[reconstruction.views.index(view.name)] for view in part.views]
+        textures, *levels = bake(surface, reconstruction.material, lights, part, density, tuple(shells.values()), maps)
         off = fit_error(reconstruction.material.specular_weight, reconstruction.material.law)
         stage.status(f"glTF's highlights are {100 * off:.0f} % off ours" if off else "no highlights")
         if len(shells) < len(settings.faces):

@@ -11,8 +11,8 @@ it, with weights of the squared density of pixels on the surface, (cos(view angl
 views decide. A view sees a texel where the first hits of the surrounding pixels lie at the texel. A texel that no view sees keeps the
 vertices' albedo.
 
-Normal map. T, N: interpolated tangent and mesh normal, B = N x T; the refined normal n is stored as (x, y, z) with
-x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
+Normal map. T, N: interpolated tangent and mesh normal, B = N x T; the refined normal n, the vertices' with what the pixels' normals tell
+beyond them (texel_normals.py), is stored as (x, y, z) with x T + y B + z N = n, coded (c + 1) / 2; glTF's convention, green up.
 
 Levels of detail. A texel of a shell, a surface with fewer faces, shows the nearest point of the full one: its albedo from the
 photographs, its material, its refined normal, which the normal map then tells relative to the shell's.
@@ -36,6 +36,7 @@ from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
 from mvps.pbr import glossy, srgb_bytes, white_level
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_senders, points_under, shadow_at, specular_shading
 from mvps.scene import Bool, Capture, Float, Int, Law, Lights, Material, Surface, View
+from mvps.texel_normals import Places, Shown, texel_normals
 from mvps.visibility import RayCaster, ray_caster
 
 LARGEST_SIDE = 4096
@@ -76,12 +77,19 @@ class Textures:
 
 
 def bake(
-    surface: Surface, material: Material, lights: Lights, capture: Capture, texels_per_pixel: float, shells: Sequence[Surface] = ()
+    surface: Surface,
+    material: Material,
+    lights: Lights,
+    capture: Capture,
+    texels_per_pixel: float,
+    shells: Sequence[Surface] = (),
+    maps: Sequence[NDArray[np.float32]] = (),
 ) -> list[Textures]:
     """Textures of a surface with its material, then of shells near it, all with the surface's exposure.
 
-    They are made from a capture's photographs under lights (in the order of the capture's views). texels_per_pixel: along one pixel's
-    footprint. ValueError where the lights do not fit the capture's photographs.
+    They are made from a capture's photographs under lights (in the order of the capture's views), and the normals (height, width, 3) of
+    their pixels, world frame, NaN outside the mask; without maps the vertices' stay. texels_per_pixel: along one pixel's footprint.
+    ValueError where the lights do not fit the capture's photographs.
     """
     _check_lights(lights, capture)
     pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
@@ -92,18 +100,20 @@ def bake(
         lambda make: make(),
         (lambda: [_charted(surface, shell, pixel / texels_per_pixel) for shell in levels], lambda: light_senders(surface, material)),
     )
-    places = [tuple(_at(source, surface, values) for values in (surface.vertices, normal)) for _, _, source in charted]
-    position, outward = (np.concatenate(values) for values in zip(*places, strict=True))
-    albedo, seen = _photographed_albedo(surface, material, lights, capture, sent, position, normalise(outward))
+    values = (surface.vertices, normal, material.normal)
+    position, outward, own = (np.concatenate([_at(source, surface, of) for _, _, source in charted]) for of in values)
+    places = Places(*(np.concatenate([getattr(source, name) for _, _, source in charted]) for name in Places._fields))
+    albedo, seen, shown = _photographed(surface, material, lights, capture, sent, (position, normalise(outward)), maps)
+    refined = texel_normals(surface, places, normalise(own), shown)
     ends = np.cumsum([len(source.face) for _, _, source in charted])
     made: list[Textures] = []
     for shell, (atlas, texels, source), end in zip(levels, charted, ends, strict=True):
         part = slice(end - len(source.face), end)
         of_shell = np.where(seen[part, None], albedo[part], _at(source, surface, material.albedo))
-        weight, refined = (_at(source, surface, values) for values in (material.specular_weight, material.normal))
+        weight = _at(source, surface, material.specular_weight)
         scale = made[0].scale if made else None
         share = float(seen[part].mean()) if end > part.start else 0.0
-        made.append(_pictures(shell, atlas, texels, of_shell, weight, refined, material.law, share, scale))
+        made.append(_pictures(shell, atlas, texels, of_shell, weight, refined[part], material.law, share, scale))
     return made
 
 
@@ -231,32 +241,44 @@ def _at(texels: Texels, surface: Surface, values: Float) -> Float:
     return interpolated
 
 
-def _photographed_albedo(
-    surface: Surface, material: Material, lights: Lights, capture: Capture, sent: Senders | None, position: Float, normal: Float
-) -> tuple[Float, Bool]:
-    """Albedo (n, 3) at surface points with mesh normals (n, 3), and where a photograph shows it (n,)."""
-    caster = ray_caster(surface)
-    total, weights = np.zeros((len(position), 3)), np.zeros(len(position))
+def _photographed(
+    surface: Surface,
+    material: Material,
+    lights: Lights,
+    capture: Capture,
+    sent: Senders | None,
+    points: tuple[Float, Float],
+    maps: Sequence[NDArray[np.float32]],
+) -> tuple[Float, Bool, Shown]:
+    """Albedo (n, 3) at surface points, position and mesh normal (n, 3) each, where a photograph shows it (n,), and the pixels' normals."""
+    caster, (position, normal) = ray_caster(surface), points
+    albedo, normals = np.zeros((2, len(position), 3))
+    weights, squares = np.zeros((2, len(position)))
 
     def solved(i: int) -> list[tuple[Int, Float, Float]]:
         view, direction, intensity = capture.views[i], lights.direction[i], lights.intensity[i]
         arriving = light_arriving(sent, direction, view.camera.centre)
-        hit, albedo, known = pixel_albedo(caster, material, view, direction, intensity, arriving)
+        hit, told, known = pixel_albedo(caster, material, view, direction, intensity, arriving)
         known &= away_from_border(view)
+        if maps:
+            told = np.concatenate([told, np.nan_to_num(maps[i][view.mask])], 1)
         parts = []
         for start in range(0, len(position), TEXELS_PER_CHUNK):
             part = slice(start, start + TEXELS_PER_CHUNK)
-            seen, sampled, weight = _sampled(view, hit, albedo, known, position[part], normal[part])
+            seen, sampled, weight = _sampled(view, hit, told, known, position[part], normal[part])
             parts.append((start + seen, sampled, weight))
         return parts
 
     for parts in one_by_one(solved, len(capture.views)):
         for seen, sampled, weight in parts:
-            total[seen] += weight[:, None] * sampled
+            albedo[seen] += weight[:, None] * sampled[:, :3]
             weights[seen] += weight
+            squares[seen] += weight**2
+            if maps:
+                normals[seen] += weight[:, None] * normalise(sampled[:, 3:])
     known = weights > 0
-    total[known] /= weights[known, None]
-    return total, known
+    albedo[known] /= weights[known, None]
+    return albedo, known, Shown(normals, weights, squares)
 
 
 def away_from_border(view: View) -> Bool:
@@ -266,8 +288,8 @@ def away_from_border(view: View) -> Bool:
     return away
 
 
-def _sampled(view: View, hit: Float, albedo: NDArray[np.float32], known: Bool, position: Float, normal: Float) -> tuple[Int, Float, Float]:
-    """Which of some surface points (m, 3) the view sees (n,), the albedo (n, 3) of the pixels around them, and its weight (n,)."""
+def _sampled(view: View, hit: Float, told: NDArray[np.float32], known: Bool, position: Float, normal: Float) -> tuple[Int, Float, Float]:
+    """Which of some surface points (m, 3) the view sees (n,), values (n, k) of the pixels around them, and their weight (n,)."""
     facing = np.einsum("ni,ni->n", normal, view_directions(view.camera, position))
     chosen = np.flatnonzero(facing > STEEPEST_VIEW)
     image, depth = project(view.camera, position[chosen])
@@ -281,7 +303,7 @@ def _sampled(view: View, hit: Float, albedo: NDArray[np.float32], known: Bool, p
     total = share.sum(1)
     # Where the point hides behind another part, all four pixels hit that part instead.
     sees = total > 0.5
-    result = np.einsum("nk,nkc->nc", share[sees], albedo[where[sees]]) / total[sees, None]
+    result = np.einsum("nk,nkc->nc", share[sees], told[where[sees]]) / total[sees, None]
     density = facing[chosen] / pixel**2
     return chosen[sees], result, (density**2 * total)[sees]
 

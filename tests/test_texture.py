@@ -16,9 +16,10 @@ from sphere_scene import RADIUS, SphereScene, colours, make_sphere
 
 from mvps.atlas import Atlas, rasterise
 from mvps.gltf import glb_bytes, metallic_roughness
+from mvps.joint.stated import icosahedron
 from mvps.mesh import decimated, nearest, normalise, vertex_normals
 from mvps.pbr import glossy
-from mvps.rendering import photograph
+from mvps.rendering import photograph, points_under
 from mvps.scene import Capture, Lights, Material, Surface, View
 from mvps.texture import Textures, _robust_albedo, bake, pixel_albedo, png_bytes
 from mvps.visibility import RayCaster
@@ -196,6 +197,23 @@ def test_a_matt_surface_says_so(scene: SphereScene) -> None:
     material = document["materials"][0]  # type: ignore[index]
     assert material["extensions"]["KHR_materials_specular"] == {"specularFactor": 0.0}
     assert material["extras"]["albedo_scale"] == textures.scale
+
+
+def test_the_normal_map_shows_what_pixels_tell_beyond_vertices() -> None:
+    """Vertices without waves, and pixels that show them in three views or four."""
+    r, capture = make_sphere(seen_from=icosahedron().tolist())
+    smooth = replace(r.material, normal=vertex_normals(r.surface))
+    caster = RayCaster(r.surface)
+    maps = []
+    for view in capture.views:
+        picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
+        picture[view.mask] = points_under(caster, r.material, view.camera, view.pixels).normal
+        maps.append(picture)
+    wanted, without, found = (
+        bake(r.surface, material, r.lights, capture, 2, maps=of)[0].normal_map.astype(float)
+        for material, of in ((r.material, []), (smooth, []), (smooth, maps))
+    )
+    assert np.abs(found - wanted).mean() < 0.1 * np.abs(without - wanted).mean()
 
 
 def test_saturated_samples_and_outliers_do_not_count(scene: SphereScene) -> None:
