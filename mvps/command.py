@@ -13,6 +13,7 @@ import io
 import logging
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -35,6 +36,9 @@ NO_MEMORY = ("allocate memory", "out of memory", "start new thread", "insufficie
 
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 """Faults of writing to an open file, which name none."""
+
+BELOW_ZERO = re.compile(r"-\.?\d[\d\s.,eE+-]*")
+"""A value of an option, one number or several, that argparse would take for an option."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -59,12 +63,22 @@ def parser(module: str, description: str) -> Parser:
 
 def parse(made: Parser, argv: Sequence[str]) -> argparse.Namespace:
     """The arguments; --quiet and --verbose take effect on the logger "mvps"."""
-    arguments = made.parse_args(argv)
+    arguments = made.parse_args(_joined(argv))
     logger = logging.getLogger("mvps")
     logger.setLevel(logging.WARNING if arguments.quiet else logging.DEBUG if arguments.verbose else logging.INFO)
     if not any(isinstance(handler, ConsoleHandler) for handler in logger.handlers):
         logger.addHandler(ConsoleHandler())
     return arguments
+
+
+def _joined(argv: Sequence[str]) -> list[str]:
+    """The arguments with each option and a value below zero that follows it as one: "--light", "-1,0,1" -> "--light=-1,0,1"."""
+    joined: list[str] = []
+    for word in argv:
+        before = joined[-1] if joined else ""
+        option = before.startswith("--") and before != "--" and "=" not in before and "--" not in joined
+        joined[-1:] = [f"{before}={word}"] if option and BELOW_ZERO.fullmatch(word) else [*joined[-1:], word]
+    return joined
 
 
 class _Ended(KeyboardInterrupt):
@@ -137,8 +151,8 @@ def _of_the_machine(error: Exception) -> str:
     if isinstance(error, MemoryError) or any(words in str(error).lower() for words in NO_MEMORY):
         said = str(error).strip().splitlines()[:1] or ["none was left"]
         return (
-            f"memory: wanted more than there is ({said[0][:120]}); use fewer --views or --lights, a quicker --preset or --max-memory,"
-            " or raise the limit (ulimit -v)"
+            f"memory: wanted more than there is ({said[0][:120]}); ask for fewer or smaller images, end other programs, or raise the"
+            " limit (ulimit -v)"
         )
     if isinstance(error, OSError) and error.filename is not None:
         name = error.filename if isinstance(error.filename, str) else os.fsdecode(error.filename)

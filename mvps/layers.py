@@ -4,12 +4,17 @@
 
 Every layer is the mean over SUBPIXELS rays a pixel, those that miss the surface left out; coverage is the part of them that meet it.
 With many lights each ray takes its share of them, times the number of rays: neighbours of one pixel see nearly the same point, so
-the mean is that under all lights at the price of one ray.
+the mean is that under all lights at the price of one ray. Where a ray of a pixel misses, its share would be missing too, so the others
+take all lights; those are the few pixels along an outline.
+
+Pixels are worked on a part at a time: memory grows with the picture's own values only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +38,18 @@ MANY_LIGHTS = 16
 SAMPLES_PER_CHUNK = 1 << 21
 """Points times lights worked on at a time."""
 
+PIXELS_AT_A_TIME = 1 << 17
+"""Some 150 MB of rays and of what they meet."""
+
+LIGHTS_AT_A_TIME = 64
+"""A multiple of SUBPIXELS: shares of parts are parts of shares."""
+
+ARRIVING_KEPT = 16
+"""Of such parts of the lights, what surfaces send each other, for the next pixels: 15 MB each with lobes."""
+
+Sent = Callable[[int], Arriving | None]
+"""What other surfaces send under the LIGHTS_AT_A_TIME lights from this one on, or under the points of light where it is below 0."""
+
 
 def rendered(
     caster: RayCaster, material: Material, camera: Camera, light: Illumination, layers: Sequence[str], senders: Senders | None = None
@@ -44,73 +61,105 @@ def rendered(
 
     senders: what sends light on (rendering.light_senders), for inter-reflection; None: without.
     """
-    side = int(np.sqrt(SUBPIXELS))
-    fine = Camera(np.diag([side, side, 1.0]) @ camera.K, camera.rotation, camera.translation, side * camera.height, side * camera.width)
-    sums: dict[str, Layer] = {}
-    count = np.zeros((camera.height, camera.width), np.float32)
-    for k in range(SUBPIXELS):
-        row, column = divmod(k, side)
-        pixels = side * np.argwhere(np.ones(count.shape, bool)) + (row, column)
-        share = _share(light, k)
-        found, hit = _of_pixels(caster, material, fine, pixels, share, layers, senders)
-        count += hit.reshape(count.shape)
+    pixels = camera.height * camera.width
+    coverage, means = np.zeros(pixels, np.float32), dict[str, Layer]()
+    sent = _sending(senders, light, camera.centre)
+    for start in range(0, pixels, PIXELS_AT_A_TIME):
+        part = np.arange(start, min(start + PIXELS_AT_A_TIME, pixels))
+        found, coverage[part] = _of_pixels(caster, material, camera, part, light, layers, sent)
         for name, values in found.items():
-            whole = values.reshape(*count.shape, *values.shape[1:])
-            sums[name] = sums[name] + whole if name in sums else whole
-    over = np.maximum(count, np.float32(1))
-    means: dict[str, Layer] = {name: np.divide(total, over[..., None] if total.ndim == 3 else over) for name, total in sums.items()}
-    if "normals" in means:
-        means["normals"] /= np.maximum(lengths(means["normals"])[..., None], 1e-6).astype(np.float32)
-    return means, count / np.float32(SUBPIXELS)
+            means.setdefault(name, np.zeros((pixels, *values.shape[1:]), np.float32))[part] = values
+    shape = (camera.height, camera.width)
+    return {name: values.reshape(*shape, *values.shape[1:]) for name, values in means.items()}, coverage.reshape(shape)
 
 
-def _share(light: Illumination, k: int) -> Illumination:
-    """The k-th ray's part of the lights."""
-    if len(light.direction) < MANY_LIGHTS:
-        return light
-    some = slice(k, None, SUBPIXELS)
-    return Illumination(light.direction[some], SUBPIXELS * light.intensity[some], light.position, light.strength, light.spread[some])
+def _sending(senders: Senders | None, light: Illumination, eye: Float) -> Sent:
+    """What arrives from senders, towards a camera at eye (3,)."""
+
+    @lru_cache(maxsize=ARRIVING_KEPT)
+    def sent(first: int) -> Arriving | None:
+        if first < 0:
+            return light_arriving_of_points(senders, light.position, eye)
+        return light_arriving(senders, light.direction[first : first + LIGHTS_AT_A_TIME], eye)
+
+    return sent
 
 
 def _of_pixels(
-    caster: RayCaster, material: Material, camera: Camera, pixels: Int, light: Illumination, layers: Sequence[str], senders: Senders | None
-) -> tuple[dict[str, Layer], Bool]:
-    """Layers (n[, 3]) of pixels (n, 2), 0 where nothing is hit, and where something is."""
-    points = points_under(caster, material, camera, pixels)
-    hit = np.flatnonzero(points.hit)
-    seen = points.part(hit)
-    found: dict[str, Float] = {"albedo": seen.albedo, "normals": seen.normal, "confidence": seen.confidence}
-    found["depth"] = (seen.position @ camera.rotation.T + camera.translation)[:, 2]
-    if {"image", "specular", "shadow"} & set(layers):
-        found |= _lit(caster, material, camera, seen, light, senders)
+    caster: RayCaster, material: Material, camera: Camera, pixels: Int, light: Illumination, layers: Sequence[str], sent: Sent
+) -> tuple[dict[str, Layer], Layer]:
+    """Layers (n[, 3]) of pixels (n,), counted along the rows, 0 where nothing is hit, and coverage (n,)."""
+    side = int(np.sqrt(SUBPIXELS))
+    fine = Camera(np.diag([side, side, 1.0]) @ camera.K, camera.rotation, camera.translation, side * camera.height, side * camera.width)
+    corners, within = (np.stack(np.divmod(a, b), -1) for a, b in ((pixels, camera.width), (np.arange(SUBPIXELS), side)))
+    points = points_under(caster, material, fine, (side * corners + within[:, None]).reshape(-1, 2))
+    found: dict[str, NDArray[Any]] = {"albedo": points.albedo, "normals": points.normal, "confidence": points.confidence}
+    found["depth"] = np.where(points.hit, (points.position @ camera.rotation.T + camera.translation)[:, 2], 0)
+    hit = points.hit.reshape(SUBPIXELS, -1)
+    lit = {"image", "specular", "shadow"} & set(layers)
+    found |= {name: np.zeros(hit.size if name == "shadow" else (hit.size, 3)) for name in lit}
+    for rays, share in _groups(hit, len(light.direction)) if lit else ():
+        of_rays = _lit(caster, material, camera, points.part(rays), light, share, sent)
+        for name in lit:
+            found[name][rays] = of_rays[name]
+    count = np.maximum(hit.sum(0), 1).astype(np.float32)
 
-    def spread(values: Float) -> Layer:
-        whole = np.zeros((len(pixels), *values.shape[1:]), np.float32)
-        whole[hit] = values
-        return whole
+    def mean(values: Float) -> Layer:
+        total: Layer = values.astype(np.float32).reshape(*hit.shape, *values.shape[1:]).sum(0)
+        total /= count if total.ndim == 1 else count[:, None]
+        return total
 
-    return {name: spread(found[name]) for name in layers}, points.hit
+    means = {name: mean(found[name]) for name in layers}
+    if "normals" in means:
+        means["normals"] /= np.maximum(lengths(means["normals"])[:, None], 1e-6).astype(np.float32)
+    return means, hit.mean(0, dtype=np.float32)
+
+
+def _groups(hit: Bool, lights: int) -> list[tuple[Int, slice]]:
+    """Rays (SUBPIXELS, n) that hit something, as numbers of them, and the lights that each group takes."""
+    if lights < MANY_LIGHTS:
+        return [(np.flatnonzero(hit), slice(None))]
+    covered = hit.all(0)
+    groups = [(k * hit.shape[1] + np.flatnonzero(covered), slice(k, None, SUBPIXELS)) for k in range(SUBPIXELS)]
+    return [*groups, (np.flatnonzero(hit & ~covered), slice(None))]
 
 
 def _lit(
-    caster: RayCaster, material: Material, camera: Camera, points: Points, light: Illumination, senders: Senders | None
+    caster: RayCaster, material: Material, camera: Camera, points: Points, light: Illumination, share: slice, sent: Sent
 ) -> dict[str, Float]:
-    """image, specular (n, 3) and shadow (n,)."""
+    """image, specular (n, 3) and shadow (n,) under a share of the lights, which stands for all of them, and all points of light."""
+    n = len(points.position)
+    found: dict[str, Float] = {"image": np.zeros((n, 3)), "specular": np.zeros((n, 3)), "shadow": np.zeros(n)}
+    at_a_time = len(range(LIGHTS_AT_A_TIME)[: len(light.direction)][share])
+    step = max(1, SAMPLES_PER_CHUNK // max(1, at_a_time, len(light.position)))
+    for start in range(0, n, step):
+        part = slice(start, start + step)
+        for name, values in _lit_part(caster, material, camera, points.part(part), light, share, sent).items():
+            found[name][part] = values
+    return found
+
+
+def _lit_part(
+    caster: RayCaster, material: Material, camera: Camera, points: Points, light: Illumination, share: slice, sent: Sent
+) -> dict[str, Float]:
     view = view_directions(camera, points.position)
     image, specular = np.zeros((len(view), 3)), np.zeros((len(view), 3))
     hidden, arriving = np.zeros(len(view)), np.zeros(len(view))
-    step = max(1, SAMPLES_PER_CHUNK // max(1, len(view)))
-    for start in range(0, len(light.direction), step):
-        direction, intensity, wide = (a[start : start + step] for a in (light.direction, light.intensity, light.spread))
+    for start in range(0, len(light.direction), LIGHTS_AT_A_TIME):
+        some = slice(start, start + LIGHTS_AT_A_TIME)
+        direction, intensity, wide = (a[some][share] for a in (light.direction, light.intensity, light.spread))
+        if not len(direction):
+            continue
+        intensity = intensity * (share.step or 1)
         shadow = shadow_at(caster, material.law, points, direction)
         image += np.einsum("nlc,nl,lc->nc", shaded(points, view, material, direction, wide), ~shadow, intensity)
         lobes = specular_shading(points.normal, view, direction, points.specular_weight, material.law, wide)
         specular += np.einsum("nlc,nl,lc->nc", np.broadcast_to(lobes, (*shadow.shape, 3)), ~shadow, intensity)
         flux = np.maximum(points.normal @ direction.T, 0) * intensity.mean(1)
         hidden, arriving = hidden + (flux * shadow).sum(1), arriving + flux.sum(1)
-        image += _sent(light_arriving(senders, direction, camera.centre), points, intensity)
+        image += _sent(sent(start), points, intensity, share)
     if len(light.position):
-        image += _sent(light_arriving_of_points(senders, light.position, camera.centre), points, light.strength)
+        image += _sent(sent(-1), points, light.strength)
     for position, strength in zip(light.position, light.strength, strict=True):
         apart = position - points.position
         distance = lengths(apart)[:, None]
@@ -124,11 +173,11 @@ def _lit(
     return {"image": image, "specular": specular, "shadow": hidden / np.maximum(arriving, 1e-12)}
 
 
-def _sent(arriving: Arriving | None, points: Points, strength: Float) -> Float:
-    """(n, 3) radiance that points return of what other surfaces send them, under lights of this strength (lights, 3)."""
+def _sent(arriving: Arriving | None, points: Points, strength: Float, share: slice = slice(None)) -> Float:
+    """(n, 3) radiance that points return of what other surfaces send them, under a share of the lights, of this strength (lights, 3)."""
     if arriving is None:
         return np.zeros_like(points.albedo)
-    of_albedo, of_lobes = arriving.at(points)
+    of_albedo, of_lobes = arriving._replace(G=arriving.G[:, share]).at(points)
     sent: Float = np.einsum("nlc,lc->nc", points.albedo[:, None] * of_albedo + of_lobes, strength)
     return sent
 

@@ -1,7 +1,8 @@
 """Pictures of a result from any camera under any light, as files: the whole way behind mvps.render's cameras and lights.
 
 A file a camera and layer, CAMERA_LAYER.png: 8-bit sRGB with coverage as transparency, 16-bit linear, or EXR with the values as they are
-(radiance, world units, unit vectors). In PNG normals are (n + 1) / 2 and depth is near white to far black.
+(radiance, world units, unit vectors). In PNG normals are (n + 1) / 2 and depth is near white to far black, from the nearest to the
+farthest point of all the pictures. Videos show what the 8-bit PNGs do, whatever the pictures' format.
 """
 
 from __future__ import annotations
@@ -10,25 +11,28 @@ import shutil
 import subprocess
 from argparse import Namespace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.edits import edited, read_edits
 from mvps.export import read_reconstruction
 from mvps.folders import appearing_whole
 from mvps.illumination import Illumination, environment_lights
-from mvps.layers import Layer, rendered
+from mvps.layers import PIXELS_AT_A_TIME, Layer, rendered
 from mvps.load import read_environment
 from mvps.mesh import lengths, normalise
 from mvps.pbr import srgb_bytes, white_level
 from mvps.progress import Progress
+from mvps.render import LARGEST
 from mvps.rendering import light_senders
 from mvps.same_object import capture_of
-from mvps.scene import Camera, CaptureError, Float, Reconstruction
+from mvps.scene import Camera, CaptureError, Float, Material, Reconstruction
 from mvps.texture import png_bytes
 from mvps.viewpoints import ball_around, look_at, read_cameras, turntable
-from mvps.visibility import ray_caster
+from mvps.visibility import RayCaster, ray_caster
 
 SHOULDER = (1.0, 1.0, 2.0)
 """Direction of the light where none is asked for; x right, y up, z towards the camera."""
@@ -37,12 +41,22 @@ FRAMES_PER_SECOND = 24
 """Of videos: cinema's."""
 
 
+class Range(NamedTuple):
+    """Of the values that all pictures of a command show: the factor of radiance, 0 while it is not known; depths that are white and
+    black."""
+
+    exposure: float
+    nearest: float
+    farthest: float
+
+
 def write_pictures(given: Namespace) -> None:
     """Renders what the options of mvps.render ask for into a new folder. CaptureError about everything that is wrong with them."""
-    if given.video and given.format == "exr":
-        raise CaptureError("--video: wanted pictures in png or png16 to make it of, given --format exr")
     result = read_reconstruction(given.result)
     cameras = chosen_cameras(given, result)
+    sizes = {f"{camera.width} x {camera.height}": None for camera in cameras.values()}
+    if given.video and len(sizes) > 1:
+        raise CaptureError(f"--video: wanted cameras of one size, given {' and '.join([*sizes][:2])}; leave --video out")
     material = result.material
     if "edit" in given:
         seen_from = {v.name: v.camera for v in capture_of(result, given.capture, lights=[1]).views} if "capture" in given else cameras
@@ -53,29 +67,67 @@ def write_pictures(given: Namespace) -> None:
     encoder = ffmpeg() if given.video else ""
     caster = ray_caster(result.surface)
     senders = None if given.no_bounce else light_senders(result.surface, material)
-    exposure = given.exposure if "exposure" in given else 0.0
-    with appearing_whole(given.out) as writing, Progress().stage("render", total=len(cameras)) as stage:
-        for name, camera in cameras.items():
-            light = chosen_light(given, camera, environment, ball_around(result.surface)[0])
-            found, coverage = rendered(caster, material, camera, light, given.layers, senders)
-            if "image" in found and not exposure:
-                exposure = 1 / white_level(found["image"][coverage > 0])
-            for layer, values in found.items():
-                write_layer(writing, f"{name}_{layer}", layer, values, coverage, exposure or 1.0, given.format)
-            stage.advance(1)
+    # What overflows is found by check_finite, which says it better.
+    with appearing_whole(given.out) as writing, np.errstate(all="ignore"):
+        frames = writing / ".frames" if given.video and given.format != "png" else writing
+        frames.mkdir(exist_ok=True)
+        shown = Range(given.exposure if "exposure" in given else 0.0, *depths_of(given, caster, material, cameras))
+        with Progress().stage("render", total=len(cameras)) as stage:
+            for name, camera in cameras.items():
+                light = chosen_light(given, camera, environment, ball_around(result.surface)[0])
+                exposing = not shown.exposure and not {"image", "specular"}.isdisjoint(given.layers)
+                layers = tuple(dict.fromkeys((*given.layers, "image"))) if exposing else given.layers
+                found, coverage = rendered(caster, material, camera, light, layers, senders)
+                check_finite(found)
+                shown = shown._replace(exposure=exposure_of(found["image"], coverage)) if exposing else shown
+                for layer in given.layers:
+                    write_layer(writing, f"{name}_{layer}", layer, found[layer], coverage, shown, given.format)
+                    if frames != writing:
+                        write_layer(frames, f"{name}_{layer}", layer, found[layer], coverage, shown, "png")
+                stage.advance(1)
         for layer in given.layers if given.video else ():
-            write_video(encoder, writing, list(cameras), layer)
+            write_video(encoder, frames, list(cameras), layer, writing)
+        if frames != writing:
+            shutil.rmtree(frames)
+
+
+def depths_of(given: Namespace, caster: RayCaster, material: Material, cameras: dict[str, Camera]) -> tuple[float, float]:
+    """The nearest and the farthest depth in any of the pictures; only looked for where they are shown."""
+    if "depth" not in given.layers or (given.format == "exr" and not given.video):
+        return 0.0, 1.0
+    seen = []
+    with Progress().stage("depth", total=len(cameras)) as stage:
+        for camera in cameras.values():
+            found, coverage = rendered(caster, material, camera, Illumination(), ["depth"])
+            check_finite(found)
+            depth = found["depth"][coverage > 0]
+            seen += [float(depth.min()), float(depth.max())] if len(depth) else []
+            stage.advance(1)
+    return min(seen, default=0.0), max(seen, default=1.0)
+
+
+def exposure_of(image: Layer, coverage: Layer) -> float:
+    """The factor that makes a picture's highlights white; 0 where it shows nothing or all is dark."""
+    seen = image[coverage > 0]
+    return min(1 / white_level(seen), LARGEST) if seen.any() else 0.0
+
+
+def check_finite(found: dict[str, Layer]) -> None:
+    """CaptureError where values are too large for a picture."""
+    for layer, values in found.items():
+        if not np.isfinite(values).all():
+            raise CaptureError(
+                f"{layer}: wanted values that are finite in single precision, given larger ones; try weaker lights, a camera nearer to the"
+                " object, or milder edits"
+            )
 
 
 def chosen_cameras(given: Namespace, result: Reconstruction) -> dict[str, Camera]:
-    """By name, those of the option that names any. CaptureError where two do, or an option lacks the one that it belongs to."""
+    """By name, those of the option that names any. CaptureError where two do."""
     width, height = given.size
     named = [f"--{option}" for option in ("cameras", "camera", "turntable") if option in given]
     if len(named) > 1:
         raise CaptureError(f"wanted one of --cameras, --camera and --turntable, given {' and '.join(named)}")
-    for option, owner in (("target", "camera"), ("views", "capture")):
-        if option in given and owner not in given:
-            raise CaptureError(f"--{option}: wanted together with --{owner}, given alone")
     centre, _ = ball_around(result.surface)
     if "cameras" in given:
         return read_cameras(given.cameras)
@@ -110,32 +162,39 @@ def chosen_light(given: Namespace, camera: Camera, environment: Illumination | N
     return own if environment is None else own.with_also(environment)
 
 
-def as_shown(layer: str, values: Layer, coverage: Layer, exposure: float) -> Layer:
+def as_shown(layer: str, values: Layer, coverage: Layer, shown: Range) -> Layer:
     """The values of a layer, linear in [0, 1]: what a PNG holds."""
     if layer == "normals":
         return np.float32(0.5) * (values + np.float32(1))
     if layer == "depth":
-        seen = values[coverage > 0] if (coverage > 0).any() else np.zeros(1)
-        near, far = float(seen.min()), float(seen.max())
-        depth: Layer = np.where(coverage > 0, 1 - (values - near) / max(far - near, 1e-12), 0).astype(np.float32)
-        return depth
-    return values * np.float32(exposure if layer in ("image", "specular") else 1.0)
+        depth: Layer = 1 - (values - shown.nearest) / max(shown.farthest - shown.nearest, 1e-12)
+        return np.where(coverage > 0, depth, 0).astype(np.float32)
+    return values * np.float32((shown.exposure or 1.0) if layer in ("image", "specular") else 1.0)
 
 
-def write_layer(folder: Path, name: str, layer: str, values: Layer, coverage: Layer, exposure: float, form: str) -> None:
+def write_layer(folder: Path, name: str, layer: str, values: Layer, coverage: Layer, shown: Range, form: str) -> None:
     """One file. form: one of mvps.render's formats."""
     if form == "exr":
         write_exr(folder / f"{name}.exr", values, coverage)
         return
-    shown = as_shown(layer, values, coverage, exposure).clip(0, 1)
+    rows = max(1, PIXELS_AT_A_TIME // values.shape[1])
+    parts = [slice(start, start + rows) for start in range(0, len(values), rows)]
+    coded = np.concatenate([code_values(layer, values[part], coverage[part], shown, form) for part in parts])
+    (folder / f"{name}.png").write_bytes(png_bytes(coded))
+
+
+def code_values(layer: str, values: Layer, coverage: Layer, shown: Range, form: str) -> NDArray[Any]:
+    """What a PNG stores of some rows: 16 bits, or 8 bits with coverage as transparency."""
+    part = as_shown(layer, values, coverage, shown).clip(0, 1)
     if form == "png16":
-        (folder / f"{name}.png").write_bytes(png_bytes(np.rint(shown * 65535).astype(np.uint16)))
-        return
+        linear: NDArray[np.uint16] = np.rint(part * 65535).astype(np.uint16)
+        return linear
     # Radiance and albedo are linear and screens are not; the others are no light.
-    colour = srgb_bytes(shown) if layer in ("image", "specular", "albedo") else np.rint(shown * 255).astype(np.uint8)
+    colour = srgb_bytes(part) if layer in ("image", "specular", "albedo") else np.rint(part * 255).astype(np.uint8)
     colour = colour if colour.ndim == 3 else np.repeat(colour[..., None], 3, axis=2)
     alpha = np.rint(coverage * 255).astype(np.uint8)[..., None]
-    (folder / f"{name}.png").write_bytes(png_bytes(np.concatenate([colour, alpha], axis=2)))
+    coded: NDArray[np.uint8] = np.concatenate([colour, alpha], axis=2)
+    return coded
 
 
 def write_exr(path: Path, values: Layer, coverage: Layer) -> None:
@@ -160,14 +219,14 @@ def ffmpeg() -> str:
     return str(get_ffmpeg_exe())
 
 
-def write_video(encoder: str, folder: Path, names: list[str], layer: str) -> None:
-    """LAYER.mp4 of the pictures NAME_LAYER.png in their order, on white."""
+def write_video(encoder: str, folder: Path, names: list[str], layer: str, out: Path) -> None:
+    """LAYER.mp4 in the folder `out`, of the 8-bit pictures NAME_LAYER.png in their order, on white."""
     listed = folder / f".{layer}.txt"
     listed.write_text("".join(f"file '{name}_{layer}.png'\nduration {1 / FRAMES_PER_SECOND}\n" for name in names), encoding="utf-8")
     even = "format=rgba,pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white@0"
     onto_white = f"{even},split[a][b];[b]drawbox=c=white:t=fill:replace=1[w];[w][a]overlay,format=yuv420p"
     command = [encoder, "-v", "error", "-f", "concat", "-i", listed.name, "-filter_complex", onto_white, "-r", str(FRAMES_PER_SECOND)]
-    done = subprocess.run([*command, f"{layer}.mp4"], cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run([*command, str(out.resolve() / f"{layer}.mp4")], cwd=folder, capture_output=True, text=True, check=False)
     listed.unlink()
     if done.returncode:
         raise CaptureError(f"--video: wanted a video of {len(names)} pictures, given an encoder that fails ({done.stderr.strip()[:200]})")

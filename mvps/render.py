@@ -33,8 +33,8 @@ SAMPLES_PER_CHUNK = 1 << 22
 LAYERS = ("image", "albedo", "specular", "normals", "depth", "shadow", "confidence")
 """What layers.py renders, by name; here, because --help does not wait for it."""
 FORMATS = ("png", "png16", "exr")
-LARGEST = 1e100
-"""Of an option's numbers: their squares are numbers too."""
+LARGEST = 1e12
+"""Of an option's numbers: radiance times exposure, and light over a squared distance, are numbers in single precision too."""
 
 
 def render_view(
@@ -119,8 +119,8 @@ def numbers(counts: tuple[int, ...], wanted: str) -> Callable[[str], tuple[float
             found = tuple(float(word) for word in text.split(","))
         except ValueError:
             found = ()
-        if len(found) not in counts or not all(abs(x) < LARGEST for x in found):
-            raise ArgumentTypeError(f"wanted {wanted}, separated by commas, given {text!r}")
+        if len(found) not in counts or not all(abs(x) <= LARGEST for x in found):
+            raise ArgumentTypeError(f"wanted {wanted}, separated by commas, up to {LARGEST:g}, given {text!r}")
         return found
 
     return numbers_
@@ -135,11 +135,19 @@ def size(text: str) -> tuple[int, int]:
 
 
 def angle(text: str) -> float:
-    """Degrees between 0 and 180."""
+    """Degrees from 0.01, from where on cameras are not too far away for single precision, to below 180."""
     degrees = positive(text)
-    if degrees >= 180:
-        raise ArgumentTypeError(f"wanted degrees below 180, given {text!r}")
+    if not 0.01 <= degrees < 180:
+        raise ArgumentTypeError(f"wanted degrees below 180, 0.01 at least, given {text!r}")
     return degrees
+
+
+def factor(text: str) -> float:
+    """A number above zero."""
+    number = positive(text)
+    if not 1 / LARGEST <= number <= LARGEST:
+        raise ArgumentTypeError(f"wanted {1 / LARGEST:g} to {LARGEST:g}, given {text!r}")
+    return number
 
 
 def count(text: str) -> int:
@@ -195,7 +203,7 @@ def options() -> Any:
     pictures.add_argument("--format", choices=FORMATS, default="png", help="8-bit sRGB, 16-bit linear, or EXR: values as they are")
     pictures.add_argument(
         "--exposure",
-        type=positive,
+        type=factor,
         default=SUPPRESS,
         metavar="X",
         help=EXPOSURE_HELP,
@@ -206,9 +214,9 @@ def options() -> Any:
 
 
 CAMERAS_HELP = 'JSON: {"cameras": [{"name", "K", "rotation", "translation", "width", "height"}]}, camera_from_world, OpenCV axes'
-POINT_HELP = "place of a point of light, world units; its intensity at the object's middle; surfaces send none of it on"
+POINT_HELP = "place of a point of light, world units; its intensity at the object's middle"
 UP_HELP = "upwards in the world, for --camera, --turntable and --envmap"
-EXPOSURE_HELP = "factor of radiance; if left out, highlights of the first picture become white"
+EXPOSURE_HELP = "factor of radiance; if left out, highlights of the first picture that shows the object become white"
 FRAME_HELP = "of --light and --point; camera: x right, y up, z towards the camera, fixed to each camera, its origin in the object's middle"
 OWN = ("camera", "turntable", "cameras", "envmap")
 
@@ -220,23 +228,42 @@ def asks_for_own(given: Namespace) -> bool:
 
 
 def check_used(given: Namespace) -> None:
-    """CaptureError about an option that a capture's views under their own lights have no use for."""
+    """CaptureError about an option that changes nothing beside the others."""
+    placed, layers = [name for name in ("camera", "turntable", "cameras") if name in given], set(given.layers)
+    around = "turntable" in given or not (placed or "capture" in given)
+    own, lit = around or "camera" in given, bool(layers & {"image", "specular", "shadow"})
+    exposed = bool(layers & {"image", "specular"}) and (given.format != "exr" or given.video)
+    uses = {
+        "target": ("camera" in given, "--camera"),
+        "capture": (not placed or "edit" in given, "--edit, or without another option for cameras"),
+        "views": ("capture" in given and not placed, "--capture, for its cameras"),
+        "elevation": (around, "--turntable"),
+        "size": (own, "--camera or --turntable"),
+        "fov": (own, "--camera or --turntable"),
+        "up": (own or "envmap" in given, "--camera, --turntable or --envmap"),
+        "light": (lit, "a layer image, specular or shadow"),
+        "point": (lit, "a layer image, specular or shadow"),
+        "envmap": (lit, "a layer image, specular or shadow"),
+        "envmap_turn": ("envmap" in given, "--envmap"),
+        "envmap_lights": ("envmap" in given, "--envmap"),
+        "frame": (bool(given.light or given.point), "--light or --point"),
+        "no_bounce": ("image" in layers, "the layer image"),
+        "exposure": (exposed, "a layer image or specular in PNG or a video"),
+    }
     made = options()
-    for name in ("size", "fov", "up", "elevation", "target", "frame", "envmap_turn", "envmap_lights"):
-        if name in given and getattr(given, name) != made.get_default(name):
-            raise CaptureError(
-                f"--{name.replace('_', '-')}: wanted together with a camera or a light of your own, given with a capture's views under"
-                " their own lights; leave it out"
-            )
+    for name, (used, wanted) in uses.items():
+        if not used and name in given and getattr(given, name) != made.get_default(name):
+            raise CaptureError(f"--{name.replace('_', '-')}: wanted together with {wanted}, given without; leave it out")
 
 
 def main(argv: Sequence[str]) -> None:
     """The command line."""
     given = parse(options(), argv)
-    if not asks_for_own(given):
-        if "capture" not in given:
-            raise CaptureError("wanted --capture for the photographs' views, or a light or a camera, given neither; see --help")
-        check_used(given)
+    own = asks_for_own(given)
+    if not own and "capture" not in given:
+        raise CaptureError("wanted --capture for the photographs' views, or a light or a camera, given neither; see --help")
+    check_used(given)
+    if not own:
         views, edit = (getattr(given, name, None) for name in ("views", "edit"))
         render_views(given.result, given.capture, views, given.out, edit, not given.no_bounce)
         return

@@ -86,6 +86,23 @@ def test_bad_options_read_like_bad_input(capsys: pytest.CaptureFixture[str]) -> 
         assert err.count("\n") == 1
 
 
+@pytest.mark.parametrize("vector", ["-1,0,1", "-.5, -1e-3,2", "-400", "1,-1,0"])
+def test_values_below_zero_follow_their_option(vector: str) -> None:
+    made = parser("mvps.x", "")
+    made.add_argument("place", nargs="+")
+    made.add_argument("--light", action="append")
+    given = parse(made, ["here", "--light", vector, f"--light={vector}", "--quiet", "--lig", vector])
+    assert given.light == [vector] * 3 and given.quiet and given.place == ["here"]
+    assert parse(made, ["--", "--light", "-1,0"]).place == ["--light", "-1,0"]
+
+
+def test_what_is_no_number_is_no_value(capsys: pytest.CaptureFixture[str]) -> None:
+    made = parser("mvps.x", "")
+    made.add_argument("--light")
+    assert run(lambda argv: parse(made, argv) and None, ["--light", "-x,0,1"]) == 2
+    assert "expected one argument" in capsys.readouterr().err
+
+
 def test_help_shows_defaults(capsys: pytest.CaptureFixture[str]) -> None:
     made = parser("mvps.x", "What it does.\nAnd how.")
     made.add_argument("--seed", type=int, default=7, help="seed of all randomness")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import cv2
@@ -55,3 +56,28 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
     for name in (*cases, "nan.exr", "grey.exr"):
         with pytest.raises(CaptureError, match=rf"{name}: wanted"):
             read_environment(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["cut.hdr", "form.hdr", "cut.exr", "spoiled.exr"])
+def test_libraries_say_nothing_of_damaged_files(tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    picture = np.random.default_rng(0).uniform(0.1, 2, (64, 128, 3)).astype(np.float32)
+    cv2.imwrite(str(tmp_path / "a.hdr"), picture)
+    write_exr(tmp_path / "a.exr", picture)
+    hdr, exr = ((tmp_path / whole).read_bytes() for whole in ("a.hdr", "a.exr"))
+    damaged = {
+        "cut.hdr": hdr[: len(hdr) // 2],
+        "form.hdr": hdr.replace(b"32-bit_rle_rgbe", b"32-bit_rle_abcd"),
+        "cut.exr": exr[: len(exr) // 2],
+        "spoiled.exr": exr[: len(exr) // 2] + bytes(50) + exr[len(exr) // 2 + 50 :],
+    }
+    (tmp_path / name).write_bytes(damaged[name])
+    with pytest.raises(CaptureError, match="a damaged one"):
+        read_environment(tmp_path / name)
+    os.write(2, b"heard again")
+    assert capfd.readouterr() == ("", "heard again")
+
+
+def test_a_map_without_colours_is_refused_with_its_channels(tmp_path: Path) -> None:
+    write_exr(tmp_path / "grey.exr", PICTURE[..., :1], "Y")
+    with pytest.raises(CaptureError, match="with channels R, G and B, given only Y; export it again"):
+        read_environment(tmp_path / "grey.exr")

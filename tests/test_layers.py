@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
+import mvps.layers
 from mvps.illumination import Illumination, environment_lights
 from mvps.layers import rendered
 from mvps.render import LAYERS
@@ -67,6 +68,36 @@ def test_a_polished_body_shows_an_environment_and_not_its_lights(scene: SphereSc
     assert few.spread.min() > 0
     off, off_dots = (np.abs(found - wanted)[middle].mean() / wanted[middle].mean() for found in (wide, narrow))
     assert off < 0.5 * off_dots
+
+
+def test_pixels_of_the_outline_see_all_of_an_environment(scene: SphereScene, caster: RayCaster, monkeypatch: pytest.MonkeyPatch) -> None:
+    sky = np.random.default_rng(1).uniform(0, 2, (16, 32, 3)).astype(np.float32) ** 4
+    light = environment_lights(sky, 70, np.array([0.0, 0.0, 1.0]))
+    shared, coverage = rendered(caster, scene.reconstruction.material, CAMERA, light, ("image", "specular", "shadow"))
+    monkeypatch.setattr(mvps.layers, "MANY_LIGHTS", 1000)
+    whole, _ = rendered(caster, scene.reconstruction.material, CAMERA, light, ("image", "specular", "shadow"))
+    outline = (coverage > 0) & (coverage < 1)
+    for name, values in shared.items():
+        np.testing.assert_allclose(values[outline], whole[name][outline], atol=1e-6)
+    assert not np.array_equal(shared["image"], whole["image"])
+    np.testing.assert_allclose(shared["image"][inner(coverage)].mean(), whole["image"][inner(coverage)].mean(), rtol=0.01)
+
+
+def test_parts_of_a_picture_join(scene: SphereScene, caster: RayCaster, monkeypatch: pytest.MonkeyPatch) -> None:
+    sky = environment_lights(np.random.default_rng(1).uniform(0, 2, (16, 32, 3)).astype(np.float32), 70, np.array([0.0, 0.0, 1.0]))
+    point = Illumination(position=np.array([[3 * RADIUS, 0, 0]]), strength=np.full((1, 3), RADIUS**2))
+    whole, coverage = rendered(caster, scene.reconstruction.material, CAMERA, sky.with_also(point), LAYERS)
+    largest = []
+    monkeypatch.setattr(mvps.layers, "PIXELS_AT_A_TIME", 1000)
+    monkeypatch.setattr(mvps.layers, "SAMPLES_PER_CHUNK", 5000)
+    under = mvps.layers.points_under
+    monkeypatch.setattr(mvps.layers, "points_under", lambda *given: largest.append(len(given[-1])) or under(*given))
+    parts, also = rendered(caster, scene.reconstruction.material, CAMERA, sky.with_also(point), LAYERS)
+    np.testing.assert_array_equal(also, coverage)
+    for name, values in whole.items():
+        np.testing.assert_array_equal(parts[name], values)
+    # Rays on their way at a time: what memory grows with.
+    assert len(largest) == 3 and max(largest) == 4000
 
 
 def test_pixels_are_the_mean_of_their_rays(scene: SphereScene, caster: RayCaster) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from sphere_scene import SphereScene, make_sphere
 
@@ -15,8 +17,9 @@ from mvps.command import run
 from mvps.export import write_reconstruction
 from mvps.load import read_environment
 from mvps.render import main, render_view
-from mvps.scene import CaptureError, Lights, Truth, View
+from mvps.scene import Camera, CaptureError, Lights, Truth, View
 from mvps.synthetic.files import write_capture
+from mvps.viewpoints import look_at
 from mvps.visibility import RayCaster
 
 SPAN = 2.0
@@ -142,12 +145,72 @@ def test_a_turntable_under_an_environment(folders: tuple[Path, Path], tmp_path: 
     assert video.read()[1][0, 0].min() > 240
 
 
+def write_cameras(path: Path, cameras: list[Camera]) -> None:
+    matrices = ("K", "rotation", "translation")
+    records = [
+        {"name": f"c{k}", "width": camera.width, "height": camera.height} | {name: getattr(camera, name).tolist() for name in matrices}
+        for k, camera in enumerate(cameras)
+    ]
+    path.write_text(json.dumps({"cameras": records}))
+
+
+@pytest.mark.parametrize("form", ["png16", "exr"])
+def test_videos_look_alike_whatever_the_format(folders: tuple[Path, Path], tmp_path: Path, form: str) -> None:
+    options = ["--turntable", "2", "--size", "40x30", "--video", "--layers", "image,normals"]
+    rendered_files(folders, tmp_path / "png", *options)
+    names = rendered_files(folders, tmp_path / form, *options, "--format", form)
+    suffix = form.removesuffix("16")
+    assert names == ["image.mp4", "normals.mp4", *(f"turn_000{k}_{layer}.{suffix}" for k in (1, 2) for layer in ("image", "normals"))]
+    for layer in ("image", "normals"):
+        assert (tmp_path / form / f"{layer}.mp4").read_bytes() == (tmp_path / "png" / f"{layer}.mp4").read_bytes()
+
+
+def test_the_first_picture_that_shows_the_object_gives_the_exposure(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    up = np.array([0.0, 0, 1])
+    away, dim, near = (
+        look_at(np.array(eye), np.array(target), up, 40, 40)
+        for eye, target in (((400.0, 0, 0), (800.0, 0, 0)), ((-400.0, 0, 0), (0.0, 0, 0)), ((400.0, 0, 0), (0.0, 0, 0)))
+    )
+    for name, cameras in {"first": [near], "later": [away, dim, near]}.items():
+        write_cameras(tmp_path / f"{name}.json", cameras)
+        for layers in ("image,specular", "specular"):
+            options = ["--cameras", str(tmp_path / f"{name}.json"), "--light", "1,0,0", "--layers", layers]
+            rendered_files(folders, tmp_path / name / layers, *options)
+    shown = {k: image(tmp_path / k / "image,specular" / f"c{c}_image.png") for k, c in (("first", 0), ("later", 2))}
+    assert shown["first"][..., :3].max() == 255
+    np.testing.assert_array_equal(shown["first"], shown["later"])
+    alone, beside, later = (
+        image(tmp_path / path)
+        for path in ("first/specular/c0_specular.png", "first/image,specular/c0_specular.png", "later/specular/c2_specular.png")
+    )
+    assert alone[..., :3].max() > 0
+    np.testing.assert_array_equal(alone, beside)
+    np.testing.assert_array_equal(alone, later)
+
+
+def test_depths_of_all_pictures_have_one_scale(folders: tuple[Path, Path], tmp_path: Path) -> None:
+    eyes = ((400.0, 0, 0), (300.0, 0, 0))
+    write_cameras(tmp_path / "c.json", [look_at(np.array(eye), np.zeros(3), np.array([0.0, 0, 1]), 40, 40) for eye in eyes])
+    cameras = ["--cameras", str(tmp_path / "c.json"), "--layers", "depth"]
+    rendered_files(folders, tmp_path / "exr", *cameras, "--format", "exr")
+    rendered_files(folders, tmp_path / "png16", *cameras, "--format", "png16")
+    depth, coverage = (
+        np.stack([OpenEXR.File(str(tmp_path / "exr" / f"c{k}_depth.exr")).channels()[name].pixels for k in (0, 1)]) for name in "YA"
+    )
+    grey = np.stack([image(tmp_path / "png16" / f"c{k}_depth.png") for k in (0, 1)])
+    seen = coverage > 0
+    near, far = depth[seen].min(), depth[seen].max()
+    assert far - near > 100
+    np.testing.assert_allclose(grey[seen] / 65535, 1 - (depth[seen] - near) / (far - near), atol=1e-4)
+    assert not grey[~seen].any()
+
+
 @pytest.mark.parametrize("form", ["png16", "exr"])
 def test_values_as_they_are(folders: tuple[Path, Path], scene: SphereScene, tmp_path: Path, form: str) -> None:
     view = scene.capture.views[0]
     light = ",".join(f"{x:.9g}" for x in (*scene.reconstruction.lights.direction[0][0], *scene.reconstruction.lights.intensity[0][0]))
-    options = ["--capture", str(folders[1]), "--views", "1", f"--light={light}", "--format", form, "--exposure", "1"]
-    rendered_files(folders, tmp_path / "out", *options)
+    options = ["--capture", str(folders[1]), "--views", "1", "--light", light, "--format", form]
+    rendered_files(folders, tmp_path / "out", *options, *(["--exposure", "1"] if form == "png16" else []))
     if form == "exr":
         found = read_environment(tmp_path / "out" / "view_01_image.exr")
     else:
@@ -160,7 +223,7 @@ def test_values_as_they_are(folders: tuple[Path, Path], scene: SphereScene, tmp_
 
 def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp_path: Path) -> None:
     (tmp_path / "edits.json").write_text('{"edits": [{"albedo": {"colour": [0, 1, 0]}}]}')
-    options = ["--camera", "400,0,0", "--light=-1,0,0.1", "--frame", "camera", "--size", "40x40", "--edit", str(tmp_path / "edits.json")]
+    options = ["--camera", "400,0,0", "--light", "-1,0,0.1", "--frame", "camera", "--size", "40x40", "--edit", str(tmp_path / "edits.json")]
     assert rendered_files(folders, tmp_path / "out", *options) == ["camera_image.png"]
     shown = image(tmp_path / "out" / "camera_image.png").astype(int)
     left, right = shown[20, 15], shown[20, 25]
@@ -186,7 +249,12 @@ def test_views_under_their_own_lights_with_an_edit(folders: tuple[Path, Path], t
         (["--light", "1e200,0,1"], "wanted three numbers"),
         (["--turntable", "1", "--up", "0,0,0"], "up: wanted a direction"),
         (["--camera", "400,0,0", "--up", "0,0,0"], "up: wanted a direction"),
-        (["--turntable", "2", "--video", "--format", "exr"], "wanted pictures in png"),
+        (["--camera", "1e99,0,0"], "wanted three numbers, separated by commas, up to 1e+12"),
+        (["--turntable", "1", "--light", "1,0,0,1e99,1e99,1e99"], "wanted three numbers"),
+        (["--turntable", "1", "--exposure", "1e308"], "wanted 1e-12 to 1e+12"),
+        (["--turntable", "2", "--fov", "1e-30"], "wanted degrees below 180, 0.01 at least"),
+        (["--cameras", "SIZES", "--video"], "--video: wanted cameras of one size, given 9 x 9 and 9 x 8"),
+        (["--turntable", "1", "--envmap", "BRIGHT", "--edit", "EDIT"], "image: wanted values that are finite"),
         (["--capture", "CAPTURE", "--size", "9x9"], "--size: wanted together with"),
         (["--layers", "image,colour"], "wanted some of image"),
         (["--light", "1,2"], "wanted three numbers"),
@@ -200,12 +268,31 @@ def test_views_under_their_own_lights_with_an_edit(folders: tuple[Path, Path], t
         (["--camera", "0,0,9", "--turntable", "8"], "wanted one of --cameras, --camera and --turntable, given --camera and --turntable"),
         (["--turntable", "8", "--target", "0,0,0"], "--target: wanted together with --camera"),
         (["--turntable", "8", "--views", "1"], "--views: wanted together with --capture"),
+        (["--capture", "CAPTURE", "--turntable", "8", "--views", "1", "--edit", "x"], "--views: wanted together with --capture"),
+        (["--capture", "CAPTURE", "--turntable", "8"], "--capture: wanted together with --edit"),
+        (["--capture", "CAPTURE", "--envmap-turn", "90"], "--envmap-turn: wanted together with --envmap"),
+        (["--turntable", "8", "--envmap-turn", "90"], "--envmap-turn: wanted together with --envmap"),
+        (["--turntable", "8", "--envmap-lights", "9"], "--envmap-lights: wanted together with --envmap"),
+        (["--turntable", "8", "--frame", "camera"], "--frame: wanted together with --light or --point"),
+        (["--camera", "0,0,9", "--elevation", "9"], "--elevation: wanted together with --turntable"),
+        (["--cameras", "x", "--fov", "9"], "--fov: wanted together with --camera or --turntable"),
+        (["--capture", "CAPTURE", "--light", "0,0,1", "--up", "1,0,0"], "--up: wanted together with --camera, --turntable or --envmap"),
+        (["--turntable", "1", "--layers", "depth", "--light", "0,0,1"], "--light: wanted together with a layer image"),
+        (["--turntable", "1", "--layers", "depth", "--no-bounce"], "--no-bounce: wanted together with the layer image"),
+        (["--turntable", "1", "--format", "exr", "--exposure", "2"], "--exposure: wanted together with a layer image or specular in PNG"),
         ([], "wanted --capture"),
     ],
 )
 def test_bad_options_write_nothing(
     folders: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str
 ) -> None:
-    named = [str(folders[1]) if option == "CAPTURE" else option for option in options]
+    looking = look_at(np.array([400.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 9, 9)
+    cameras = [looking, replace(looking, height=8)]
+    write_cameras(tmp_path / "sizes.json", cameras)
+    (tmp_path / "edit.json").write_text('{"edits": [{"albedo": {"factor": 1e6}}]}')
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict.fromkeys("RGB", np.full((4, 8), 1e37, np.float32))).write(str(tmp_path / "bright.exr"))
+    files = {"CAPTURE": folders[1], "SIZES": tmp_path / "sizes.json", "BRIGHT": tmp_path / "bright.exr", "EDIT": tmp_path / "edit.json"}
+    named = [str(files.get(option, option)) for option in options]
     assert run(main, [str(folders[0]), "--out", str(tmp_path / "out"), *named]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "out").exists()

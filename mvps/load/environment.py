@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
 import cv2
@@ -20,18 +25,35 @@ def read_environment(path: str | Path) -> NDArray[np.float32]:
     are negative or not finite."""
     path = Path(path)
     start = read_bytes(path, WANTED, "give another --envmap", 4)
-    if start.startswith(RADIANCE):
-        image = _radiance(path)
-    elif start == OPENEXR:
-        image = _openexr(path)
-    else:
+    if not start.startswith(RADIANCE) and start != OPENEXR:
         raise complaint(path, WANTED, f"a file that starts with {start!r}", "convert it")
+    with _libraries_silent():
+        image = _openexr(path) if start == OPENEXR else _radiance(path)
     if image.ndim != 3 or image.shape[2] < 3 or image.shape[0] < 2 or image.shape[1] < 2:
         raise complaint(path, f"{WANTED}, in colour", f"an array of shape {image.shape}", "export it again")
     image = np.ascontiguousarray(image[..., :3], np.float32)
     if not np.isfinite(image).all() or (image < 0).any():
         raise complaint(path, f"{WANTED}, of finite values of 0 and more", "others", "export it again")
     return image
+
+
+@contextmanager
+def _libraries_silent() -> Iterator[None]:
+    """What OpenCV and OpenEXR print about a damaged file goes nowhere: on standard error from C, and OpenEXR by Python's print. A sentence
+    of ours says it."""
+    if sys.stderr is None:
+        # The process was started without, and there is nothing to keep.
+        yield
+        return
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _radiance(path: Path) -> NDArray[np.float32]:
@@ -59,10 +81,10 @@ def _openexr(path: Path) -> NDArray[np.float32]:
             raise complaint(path, f"{WANTED}, of 1 to {PIXEL_LIMIT // 1_000_000} megapixels", f"a window {low} to {high}", "scale it down")
         with OpenEXR.File(str(path)) as file:
             channels = file.channels()
-            found = next((channels[name].pixels for name in ("RGB", "RGBA") if name in channels), None)
+            found, names = next((channels[name].pixels for name in ("RGB", "RGBA") if name in channels), None), ", ".join(channels)
     except (RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
         raise complaint(path, WANTED, f"a damaged one ({error})", "copy or export it again") from error
     if found is None:
-        raise complaint(path, f"{WANTED}, with channels R, G and B", f"channels {', '.join(channels)}", "export it again")
+        raise complaint(path, f"{WANTED}, with channels R, G and B", f"only {names}", "export it again")
     pixels: NDArray[np.float32] = np.asarray(found, np.float32)
     return pixels
