@@ -17,8 +17,9 @@ from sphere_scene import SphereScene, make_sphere
 import mvps.report.page
 from mvps.report import report_html, write_report
 from mvps.report.charts import light_sphere, line_chart, pair_chart
-from mvps.report.page import _truth
-from mvps.report.pictures import ERROR_SPAN, EXPECTED_SPAN, LARGEST_SIDE, view_pictures
+from mvps.report.page import LARGEST_BYTES, _truth
+from mvps.report.pictures import ERROR_SPAN, EXPECTED_SPAN, LARGEST_SIDE, data_address, view_pictures
+from mvps.report.pictures import LARGEST_BYTES as PICTURE_BYTES
 from mvps.scene import Capture, Lights
 from mvps.visibility import RayCaster
 
@@ -102,6 +103,23 @@ def test_the_page_needs_nothing_else(html: str) -> None:
     assert all(image["src"].startswith("data:image/jpeg;base64,") for image in page.all("img"))  # type: ignore[union-attr]
     assert len(html) < 15e6
     assert any(meta.get("name") == "viewport" for meta in page.all("meta"))
+
+
+def test_a_large_model_keeps_to_what_the_page_may_have(scene: SphereScene, html: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = make_sphere(5).reconstruction
+    large = replace(scene.reconstruction, surface=large.surface, material=large.material)
+    monkeypatch.setattr(mvps.report.page, "LARGEST_BYTES", len(html) + 20_000)
+    small = report_html(large, scene.capture)
+    assert len(html) < len(small.encode()) <= len(html) + 20_000 and "faces; model.glb shows all of them" in small
+
+
+def test_no_picture_takes_the_room_of_others() -> None:
+    grain = np.random.default_rng(0).integers(0, 256, (LARGEST_SIDE, LARGEST_SIDE, 3), np.uint8)
+    plain = np.full_like(grain, 128)
+    letters = len(data_address(grain))
+    assert PICTURE_BYTES / 2 < letters * 3 / 4 <= PICTURE_BYTES + 30
+    assert len(data_address(plain)) < letters / 5
+    assert 4 * 8 * PICTURE_BYTES * 4 / 3 < 0.6 * LARGEST_BYTES
 
 
 def test_every_picture_has_words_and_decodes(html: str) -> None:

@@ -21,6 +21,9 @@ from mvps.visibility import ray_caster
 
 VIEWS_SHOWN = 4
 
+LARGEST_BYTES = 15_000_000
+"""Of a page, so that it can be sent on: the model gets what its pictures and tables leave."""
+
 ENLARGE = """
 for(const button of document.querySelectorAll(".enlarge"))button.addEventListener("click",()=>{
 const large=button.parentElement.classList.toggle("large");button.setAttribute("aria-expanded",large);
@@ -62,9 +65,8 @@ def write_report(reconstruction: Reconstruction, capture: Capture, path: Path) -
 def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
     """The page as text. Views and lights of the capture that the reconstruction does not hold are left out of the pictures."""
     metrics = reconstruction.metrics
+    heading = _heading(reconstruction, capture)
     sections = [
-        _heading(reconstruction, capture),
-        _viewer(reconstruction, capture),
         _findings(metrics.get("findings") or []),
         _signs(metrics.get("status") or {}, metrics.get("held_out") or {}),
         _pictures(reconstruction, capture),
@@ -75,7 +77,12 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
         _stages(metrics.get("stages") or []),
         _settings(reconstruction.settings),
     ]
-    title = escape(f"Reconstruction of {capture.name}")
+    room = LARGEST_BYTES - len(_page(capture.name, [heading, *sections]).encode())
+    return _page(capture.name, [heading, _viewer(reconstruction, capture, room), *sections])
+
+
+def _page(name: str, sections: Sequence[str]) -> str:
+    title = escape(f"Reconstruction of {name}")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -145,13 +152,13 @@ def _heading(reconstruction: Reconstruction, capture: Capture) -> str:
     return f"<h1>{escape(capture.name)}</h1>\n<p>{escape(' '.join(facts))}</p>\n{outcome}"
 
 
-def _viewer(reconstruction: Reconstruction, capture: Capture) -> str:
-    """The model to turn and to light, as the first known view's camera sees it."""
+def _viewer(reconstruction: Reconstruction, capture: Capture, room: int) -> str:
+    """The model to turn and to light, as the first known view's camera sees it, in `room` bytes."""
     views = _known_views(reconstruction, capture)
     if not views:
         return ""
     rotation = views[0].camera.rotation
-    return _section("Model", viewer_html(reconstruction.surface, reconstruction.material, -rotation[1], -rotation[2]))
+    return _section("Model", viewer_html(reconstruction.surface, reconstruction.material, -rotation[1], -rotation[2], room=room))
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
