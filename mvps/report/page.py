@@ -14,6 +14,7 @@ from mvps.folders import write_whole
 from mvps.rendering import light_senders
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
+from mvps.report.words import NOT_TRIED, captured, is_number, reason, without_held_out
 from mvps.scene import Capture, Reconstruction, View
 from mvps.viewer import STYLE as VIEWER_STYLE
 from mvps.viewer import viewer_html
@@ -42,6 +43,7 @@ h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
 .enlarge{display:block;width:100%;padding:0;border:0;background:none;cursor:zoom-in}.large .enlarge{cursor:zoom-out}
 figure{margin:0}figure img{width:100%;height:auto;display:block}.grid .large img{height:90vh;object-fit:contain}figcaption{font-size:.85rem}
 .spheres{grid-template-columns:repeat(auto-fill,minmax(12rem,1fr))}.sphere{max-width:20rem}
+.facts{display:grid;grid-template-columns:fit-content(40%) 1fr;gap:.25rem 1.2rem;margin:0}.facts dt{font-weight:600}.facts dd{margin:0}
 .wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
 th,td{text-align:left;padding:.25em .8em .25em 0;border-bottom:1px solid var(--line);vertical-align:top}
 .number{text-align:right;font-variant-numeric:tabular-nums}
@@ -67,6 +69,7 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
     metrics = reconstruction.metrics
     heading = _heading(reconstruction, capture)
     sections = [
+        _captured(reconstruction, capture),
         _findings(metrics.get("findings") or []),
         _signs(metrics.get("status") or {}, metrics.get("held_out") or {}),
         _pictures(reconstruction, capture),
@@ -107,7 +110,7 @@ def _shown(value: Any) -> str:
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """A table; numbers stand to the right. All cells but _Html are escaped."""
-    numeric = [any(_is_number(row[k]) for row in rows) for k in range(len(head))]
+    numeric = [any(is_number(row[k]) for row in rows) for k in range(len(head))]
 
     def cells(tag: str, values: Sequence[Any]) -> str:
         kinds = [' class="number"' if right else "" for right in numeric]
@@ -125,10 +128,6 @@ class _Html:
         self.html = html
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
 def _columns(records: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> str:
     """A table of records with the columns (key: title) that at least one of them has."""
     kept = {key: title for key, title in names.items() if any(key in record for record in records)}
@@ -138,12 +137,11 @@ def _columns(records: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> 
 def _heading(reconstruction: Reconstruction, capture: Capture) -> str:
     surface, metrics = reconstruction.surface, reconstruction.metrics
     photographs = sum(map(len, reconstruction.light_names))
-    rig = "stand still in the camera's frame" if reconstruction.lights.one_rig else "differ between views"
     facts = [
-        f"{len(surface.vertices):,} vertices and {len(surface.faces):,} faces from {len(reconstruction.views)} views with"
-        f" {photographs} photographs; the lights {rig}."
+        f"{len(surface.vertices):,} vertices and {len(surface.faces):,} faces from {len(reconstruction.views):,} views with"
+        f" {photographs:,} photographs."
     ]
-    seconds = [stage["seconds"] for stage in metrics.get("stages") or [] if _is_number(stage.get("seconds"))]
+    seconds = [stage["seconds"] for stage in metrics.get("stages") or [] if is_number(stage.get("seconds"))]
     if seconds:
         facts.append(f"{sum(seconds):.1f} s in all.")
     status = metrics.get("status") or {}
@@ -159,6 +157,12 @@ def _viewer(reconstruction: Reconstruction, capture: Capture, room: int) -> str:
         return ""
     rotation = views[0].camera.rotation
     return _section("Model", viewer_html(reconstruction.surface, reconstruction.material, -rotation[1], -rotation[2], room=room))
+
+
+def _captured(reconstruction: Reconstruction, capture: Capture) -> str:
+    facts = captured(reconstruction, [view for view in capture.views if view.name in reconstruction.views])
+    rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(words)}</dd>" for name, words in facts)
+    return _section("Capture", f'<dl class="facts">{rows}</dl><p>Units of length are those of the capture\'s cameras.</p>')
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
@@ -188,9 +192,10 @@ HELD_OUT = {
 
 def _signs(status: Mapping[str, Any], held_out: Mapping[str, Any]) -> str:
     """By what the result was judged, without knowing the truth, and what photographs that were held back say of it."""
-    rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if _is_number(status.get(key))]
-    rows += [(what, held_out[key], "dB") for key, what in HELD_OUT.items() if _is_number(held_out.get(key))]
-    return _section("How good", _table(["sign", "value", ""], rows)) if rows else ""
+    rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if is_number(status.get(key))]
+    rows += [(what, held_out[key], "dB") for key, what in HELD_OUT.items() if is_number(held_out.get(key))]
+    instead = "" if held_out else f"<p>{escape(without_held_out(status))}</p>"
+    return _section("How good", _table(["sign", "value", "unit"], rows) + instead) if rows else ""
 
 
 def _known_views(reconstruction: Reconstruction, capture: Capture) -> list[View]:
@@ -246,17 +251,22 @@ ROUND_COLUMNS = {
 def _rounds(rounds: Sequence[Mapping[str, Any]]) -> str:
     if not rounds:
         return ""
-    residuals = [float(r["residual"]) for r in rounds if _is_number(r.get("residual"))]
-    chart = line_chart(residuals, "round", "residual") if residuals else ""
+    residuals = [r["residual"] if is_number(r.get("residual")) else None for r in rounds]
+    names = [_shown(r.get("round")) for r in rounds]
+    chart = line_chart(residuals, names, "round", "residual") if any(value is not None for value in residuals) else ""
     return _section("Rounds", chart + _columns(rounds, ROUND_COLUMNS))
 
 
 def _components(components: Sequence[Mapping[str, Any]]) -> str:
-    names = {"name": "component", "kept": "kept", "gain": "gain", "noise": "its standard error", "seconds": "time, s", "why": "why"}
     if not components:
         return ""
-    said = "<p>A component stays if it lowers the error on held-out lights (gain, as a share of it) by more than three standard errors.</p>"
-    return _section("Reflectance model", said + _columns(components, names))
+    rows = [{**c, "name": str(c.get("name", "")).partition(NOT_TRIED)[0], "why": reason(c)} for c in components]
+    names = {"name": "component", "kept": "kept", "why": "why", "gain": "gain", "noise": "its standard error", "seconds": "time, s"}
+    said = (
+        "<p>While the model is chosen, some lights of every view are kept back. A component stays if it lowers the error on them by more"
+        " than three standard errors; gain: by how much the logarithm of that error falls.</p>"
+    )
+    return _section("Reflectance model", said + _columns(rows, names))
 
 
 def _truth(truth: Mapping[str, Any]) -> str:
@@ -270,10 +280,10 @@ def _truth(truth: Mapping[str, Any]) -> str:
 def _stages(stages: Sequence[Mapping[str, Any]]) -> str:
     if not stages:
         return ""
-    longest = max((s["seconds"] for s in stages if _is_number(s.get("seconds"))), default=0) or 1
+    longest = max((s["seconds"] for s in stages if is_number(s.get("seconds"))), default=0) or 1
     shown = [
         {**s, "bar": _Html(f'<span class="bar" style="width:{6 * s["seconds"] / longest:.2f}rem"></span>')}
-        if _is_number(s.get("seconds"))
+        if is_number(s.get("seconds"))
         else s
         for s in stages
     ]
