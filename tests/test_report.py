@@ -18,7 +18,7 @@ import mvps.report.page
 from mvps.joint import neural, photometry
 from mvps.report import report_html, write_report
 from mvps.report.charts import light_sphere, line_chart, pair_chart
-from mvps.report.page import LARGEST_BYTES, _components, _rounds, _truth
+from mvps.report.page import LARGEST_BYTES, STYLE, _components, _rounds, _truth
 from mvps.report.pictures import ERROR_SPAN, EXPECTED_SPAN, LARGEST_SIDE, data_address, view_pictures
 from mvps.report.pictures import LARGEST_BYTES as PICTURE_BYTES
 from mvps.report.words import NOT_TRIED, reason
@@ -148,7 +148,7 @@ def test_numbers_are_shown(html: str) -> None:
             "20 1500 5 rounds",
             "0.0321",
             "0.0123",
-            "lobes < 2 & more yes the error falls by 12 %, 5.0 standard errors 0.125 0.025 3.5",
+            "lobes < 2 & more yes the error falls by 12 %, 5.0 standard errors 3.5",
         ),
         *(
             "normals: expected error, mean 2.5 deg",
@@ -211,14 +211,23 @@ def test_the_page_says_what_was_captured(scene: SphereScene) -> None:
             {"name": "lobe", "kept": False, "gain": 0.01, "noise": 0.001},
             "the error falls by 1 % in the light or in shadow, and rises in the other",
         ),
-        ({"name": "lobe", "kept": False, "gain": -0.1, "noise": 0.01}, "the error does not fall"),
+        ({"name": "lobe", "kept": False, "gain": -0.1, "noise": 0.1}, "the error rises by 11 %, 1.0 standard errors"),
+        ({"name": "lobe", "kept": False, "gain": 0.0, "noise": 0.0}, "the error does not change"),
         ({"name": "net: not tried, too little fits badly", "kept": False, "gain": 0.0, "noise": 0.0}, "not tried: too little fits badly"),
         ({"name": "lobe", "kept": True}, ""),
     ],
 )
 def test_why_a_component_stays_or_goes(component: dict[str, Any], said: str) -> None:
     assert reason(component) == said
-    assert f"<td>{said}</td>" in _components([component]) and "<td>net</td>" in _components([component | {"name": f"net{NOT_TRIED}far"}])
+    page = Page(_components([component, {"name": f"net{NOT_TRIED}far"}]))
+    assert said in page.text if said else "why" in page.text
+    assert page.text[-1] == "not tried: far" and "net" in page.text
+
+
+def test_sentences_have_room_on_a_phone() -> None:
+    html = _components([{"name": "lobe", "kept": False, "gain": 0.01, "noise": 0.02, "seconds": 1.0}])
+    assert '<th class="words">why</th>' in html and "<th>component</th>" in html and '<th class="number">time, s</th>' in html
+    assert ".words{min-width:" in STYLE
 
 
 def test_reasons_for_no_trial_are_told_apart_from_names() -> None:
@@ -330,6 +339,8 @@ def test_lights_lie_where_the_camera_sees_them() -> None:
     html = light_sphere(direction, np.ones((5, 3)), (1, 2, 3, 4, 5), "view_01")
     marks = {re.findall(r"light (\d)", m)[0]: m for m in re.findall(r'<circle class="light".*?</circle>', html)}
     assert 'cx="60.0" cy="-0.0"' in marks["1"] and 'cx="0.0" cy="-60.0"' in marks["2"] and "37 degrees" in marks["2"]
+    # White lights lie on a dark disc, the ring of 90 degrees.
+    assert html.index('r="100.0"') < html.index('r="86.6"') and ".ring:first-child{fill:#333}" in STYLE
     assert 'fill="none"' in marks["5"] and 'fill="none"' not in marks["4"]
 
 

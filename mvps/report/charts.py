@@ -74,7 +74,8 @@ def light_sphere(direction: Float, intensity: Float, numbers: Sequence[int], nam
 
     A light behind the object (z < 0) is drawn hollow.
     """
-    rings = "".join(f'<circle class="ring" r="{RADIUS * np.sin(np.radians(angle)):.1f}"/>' for angle in (30, 60, 90))
+    # The outermost first: it is the dark ground on which white lights are told from hollow ones.
+    rings = "".join(f'<circle class="ring" r="{RADIUS * np.sin(np.radians(angle)):.1f}"/>' for angle in (90, 60, 30))
     brightness = intensity.mean(1) / max(float(intensity.mean()), 1e-12)
     marks = []
     for k in np.argsort(direction[:, 2], kind="stable"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -21,6 +22,9 @@ from mvps.viewer import viewer_html
 from mvps.visibility import ray_caster
 
 VIEWS_SHOWN = 4
+
+LONG = 20
+"""Letters of a cell that stand on several lines."""
 
 LARGEST_BYTES = 15_000_000
 """Of a page, so that it can be sent on: the model gets what its pictures and tables leave."""
@@ -43,14 +47,15 @@ h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
 .enlarge{display:block;width:100%;padding:0;border:0;background:none;cursor:zoom-in}.large .enlarge{cursor:zoom-out}
 figure{margin:0}figure img{width:100%;height:auto;display:block}.grid .large img{height:90vh;object-fit:contain}figcaption{font-size:.85rem}
 .spheres{grid-template-columns:repeat(auto-fill,minmax(12rem,1fr))}.sphere{max-width:20rem}
+code{white-space:nowrap}
 .facts{display:grid;grid-template-columns:fit-content(40%) 1fr;gap:.25rem 1.2rem;margin:0}.facts dt{font-weight:600}.facts dd{margin:0}
 .wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
 th,td{text-align:left;padding:.25em .8em .25em 0;border-bottom:1px solid var(--line);vertical-align:top}
-.number{text-align:right;font-variant-numeric:tabular-nums}
+.number{text-align:right;font-variant-numeric:tabular-nums}.words{min-width:8rem}
 .bar{display:inline-block;height:.7em;background:var(--mark)}
 svg{width:100%;max-width:30rem;height:auto;font-size:12px}svg text{fill:currentColor}
-.axis,.ring{fill:none;stroke:var(--line)}.line{fill:none;stroke:var(--mark);stroke-width:2}.dots{fill:var(--mark)}
-.light{stroke:#777;stroke-width:1}
+.axis{fill:none;stroke:var(--line)}.ring{fill:none;stroke:#888}.ring:first-child{fill:#333}.line{fill:none;stroke:var(--mark);stroke-width:2}.dots{fill:var(--mark)}
+.light{stroke:#aaa;stroke-width:1}
 pre{background:var(--soft);padding:.8em;overflow-x:auto;font-size:.85rem}
 """
 
@@ -109,16 +114,21 @@ def _shown(value: Any) -> str:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table; numbers stand to the right. All cells but _Html are escaped."""
-    numeric = [any(is_number(row[k]) for row in rows) for k in range(len(head))]
+    """A table; numbers stand to the right, and sentences have room on a phone. All cells but _Html are escaped."""
+    kinds = [_kind([row[k] for row in rows]) for k in range(len(head))]
 
     def cells(tag: str, values: Sequence[Any]) -> str:
-        kinds = [' class="number"' if right else "" for right in numeric]
         texts = [value.html if isinstance(value, _Html) else escape(_shown(value)) for value in values]
         return "<tr>" + "".join(f"<{tag}{kind}>{text}</{tag}>" for kind, text in zip(kinds, texts, strict=True)) + "</tr>"
 
     body = "".join(cells("td", row) for row in rows)
     return f'<div class="wide"><table><thead>{cells("th", head)}</thead><tbody>{body}</tbody></table></div>'
+
+
+def _kind(column: Sequence[Any]) -> str:
+    if any(is_number(value) for value in column):
+        return ' class="number"'
+    return ' class="words"' if any(isinstance(value, str) and len(value) > LONG for value in column) else ""
 
 
 class _Html:
@@ -194,8 +204,9 @@ def _signs(status: Mapping[str, Any], held_out: Mapping[str, Any]) -> str:
     """By what the result was judged, without knowing the truth, and what photographs that were held back say of it."""
     rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if is_number(status.get(key))]
     rows += [(what, held_out[key], "dB") for key, what in HELD_OUT.items() if is_number(held_out.get(key))]
-    instead = "" if held_out else f"<p>{escape(without_held_out(status))}</p>"
-    return _section("How good", _table(["sign", "value", "unit"], rows) + instead) if rows else ""
+    # Options stay in one piece where lines break.
+    instead = re.sub("(--[a-z-]+)", r"<code>\1</code>", escape(without_held_out(status)))
+    return _section("How good", _table(["sign", "value", "unit"], rows) + ("" if held_out else f"<p>{instead}</p>")) if rows else ""
 
 
 def _known_views(reconstruction: Reconstruction, capture: Capture) -> list[View]:
@@ -261,10 +272,10 @@ def _components(components: Sequence[Mapping[str, Any]]) -> str:
     if not components:
         return ""
     rows = [{**c, "name": str(c.get("name", "")).partition(NOT_TRIED)[0], "why": reason(c)} for c in components]
-    names = {"name": "component", "kept": "kept", "why": "why", "gain": "gain", "noise": "its standard error", "seconds": "time, s"}
+    names = {"name": "component", "kept": "kept", "why": "why", "seconds": "time, s"}
     said = (
         "<p>While the model is chosen, some lights of every view are kept back. A component stays if it lowers the error on them by more"
-        " than three standard errors; gain: by how much the logarithm of that error falls.</p>"
+        " than three standard errors.</p>"
     )
     return _section("Reflectance model", said + _columns(rows, names))
 

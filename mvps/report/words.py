@@ -61,13 +61,13 @@ def reason(component: Mapping[str, Any]) -> str:
     gain, noise = component.get("gain"), component.get("noise")
     if apart or not is_number(gain) or not is_number(noise):
         return f"not tried: {why}" if apart else ""
-    if gain <= 0:
-        return "the error does not fall"
-    said = f"the error falls by {-100 * np.expm1(-gain):.2g} %"
+    if gain == 0:
+        return "the error does not change"
+    said = f"the error {'falls' if gain > 0 else 'rises'} by {100 * abs(np.expm1(-gain)):.2g} %"
     if not component.get("kept") and gain > CERTAIN * noise:
         return f"{said} in the light or in shadow, and rises in the other"
-    sure = f"{said}, {gain / noise:.1f} standard errors" if noise > 0 else f"{said}, everywhere alike"
-    return sure if component.get("kept") else f"{sure}: that may be chance"
+    sure = f"{said}, {abs(gain) / noise:.1f} standard errors" if noise > 0 else f"{said}, everywhere alike"
+    return sure if component.get("kept") or gain < 0 else f"{sure}: that may be chance"
 
 
 def without_held_out(status: Mapping[str, Any]) -> str:
