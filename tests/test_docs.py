@@ -169,6 +169,21 @@ def test_members_that_the_api_pages_pick_exist() -> None:
         assert not set(names.split(", ")) - there, module
 
 
+ROOMS = (
+    *("scene", "load", "reconstruct", "export", "texture", "pbr", "gltf", "atlas", "report", "viewer", "view", "evaluate", "measures"),
+    *("compare", "render", "new_pictures", "layers", "illumination", "viewpoints", "edits", "synthetic", "hull", "calibrate", "joint"),
+)
+"""Of mvps, that a program of its own imports."""
+
+
+def test_every_room_has_its_place_in_the_api() -> None:
+    shown = {found for path in (DOCS / "api").glob("*.md") for found in re.findall(r"^::: mvps\.(\w+)$", path.read_text(), re.M)}
+    assert not set(ROOMS) - shown
+    index, nav = page("api/index.md"), (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    pages = {path.name for path in (DOCS / "api").glob("*.md")} - {"index.md"}
+    assert not [name for name in pages if f"]({name})" not in index or f"api/{name}" not in nav]
+
+
 def test_no_page_leads_to_what_the_site_leaves_out() -> None:
     """mkdocs does not warn of that."""
     assert not [path.name for path in PAGES if re.search(r"\]\([^)]*(next\.md|docstrings\.py)", path.read_text(encoding="utf-8"))]

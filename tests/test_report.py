@@ -15,10 +15,13 @@ import pytest
 from sphere_scene import SphereScene, make_sphere
 
 import mvps.report.page
+from mvps.joint import neural, photometry
 from mvps.report import report_html, write_report
 from mvps.report.charts import light_sphere, line_chart, pair_chart
-from mvps.report.page import _truth
-from mvps.report.pictures import ERROR_SPAN, EXPECTED_SPAN, LARGEST_SIDE, view_pictures
+from mvps.report.page import LARGEST_BYTES, STYLE, _components, _rounds, _truth
+from mvps.report.pictures import ERROR_SPAN, EXPECTED_SPAN, LARGEST_SIDE, data_address, view_pictures
+from mvps.report.pictures import LARGEST_BYTES as PICTURE_BYTES
+from mvps.report.words import NOT_TRIED, reason
 from mvps.scene import Capture, Lights
 from mvps.visibility import RayCaster
 
@@ -32,9 +35,7 @@ METRICS: dict[str, Any] = {
         {"round": 2, "residual": 0.0123},
     ],
     "status": {"name": "converged", "text": "the step fell below the tolerance", "expected_deg": 2.5, "misfit": 0.0625},
-    "model": {
-        "components": [{"name": "two lobes", "kept": True, "gain": 0.125, "seconds": 3.5, "why": "0.1 dB & more than its noise < 0.02"}]
-    },
+    "model": {"components": [{"name": "lobes < 2 & more", "kept": True, "gain": 0.125, "noise": 0.025, "seconds": 3.5}]},
     "findings": [{"about": "photograph", "where": "view_03/007", "text": "is <black>", "mended": True}],
     "truth": {"chamfer_mm": 0.1875, "light_error_deg": 1.5},
 }
@@ -104,6 +105,23 @@ def test_the_page_needs_nothing_else(html: str) -> None:
     assert any(meta.get("name") == "viewport" for meta in page.all("meta"))
 
 
+def test_a_large_model_keeps_to_what_the_page_may_have(scene: SphereScene, html: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = make_sphere(5).reconstruction
+    large = replace(scene.reconstruction, surface=large.surface, material=large.material)
+    monkeypatch.setattr(mvps.report.page, "LARGEST_BYTES", len(html) + 20_000)
+    small = report_html(large, scene.capture)
+    assert len(html) < len(small.encode()) <= len(html) + 20_000 and "faces; model.glb shows all of them" in small
+
+
+def test_no_picture_takes_the_room_of_others() -> None:
+    grain = np.random.default_rng(0).integers(0, 256, (LARGEST_SIDE, LARGEST_SIDE, 3), np.uint8)
+    plain = np.full_like(grain, 128)
+    letters = len(data_address(grain))
+    assert PICTURE_BYTES / 2 < letters * 3 / 4 <= PICTURE_BYTES + 30
+    assert len(data_address(plain)) < letters / 5
+    assert 4 * 8 * PICTURE_BYTES * 4 / 3 < 0.6 * LARGEST_BYTES
+
+
 def test_every_picture_has_words_and_decodes(html: str) -> None:
     page = Page(html)
     images = page.all("img")
@@ -130,13 +148,11 @@ def test_numbers_are_shown(html: str) -> None:
             "20 1500 5 rounds",
             "0.0321",
             "0.0123",
-            "two lobes yes",
+            "lobes < 2 & more yes the error falls by 12 %, 5.0 standard errors 3.5",
         ),
         *(
             "normals: expected error, mean 2.5 deg",
             "share of the signal 6.25 %",
-            "0.125",
-            "0.1 dB & more than its noise < 0.02",
             "chamfer mm 0.1875",
             "light error deg 1.5",
             '"preset": "standard"',
@@ -151,6 +167,72 @@ def test_held_out_photographs_are_told(scene: SphereScene) -> None:
     metrics = {"held_out": {"held_out_views_psnr_db": 31.5, "photograph_scale": 1.0}}
     text = words(report_html(replace(scene.reconstruction, metrics=metrics), scene.capture))
     assert "of views that were held back, against the model: mean PSNR inside the mask 31.5 dB" in text and "lights that were" not in text
+    assert "No photographs were held back" not in text
+
+
+def test_a_page_without_held_out_photographs_says_what_it_has_instead(scene: SphereScene) -> None:
+    for status, said in (
+        ({"misfit": 0.0625}, "No photographs were held back to test the result by; mvps.reconstruct does so with --hold-out-lights or"),
+        ({"misfit": 0.0188, "noise": 0.015}, "the model leaves 1.9 % of the signal unexplained beside noise of 1.5 %"),
+    ):
+        assert said in words(report_html(replace(scene.reconstruction, metrics={"status": status}), scene.capture))
+
+
+def facts(scene: SphereScene, **changes: Any) -> dict[str, str]:
+    """What the page says of the capture."""
+    html = report_html(replace(scene.reconstruction, metrics={}, **changes), scene.capture)
+    return dict(re.findall("<dt>(.*?)</dt><dd>(.*?)</dd>", html))
+
+
+def test_the_page_says_what_was_captured(scene: SphereScene) -> None:
+    told = facts(scene, settings={"calibrated_lights": False, "hold_out_views": [2], "hold_out_lights": []})
+    assert told == {
+        "Views": "6, 1 of them held back",
+        "Lights": "10 a view: one rig that stands still in the camera&#x27;s frame; solved from the photographs",
+        "Photographs": "60",
+        "Size of a photograph": "96 x 96 pixels",
+        "Size of the object": "80 x 80 x 80 units",
+        # A sphere of radius 40 fills four fifths of 96 pixels.
+        "A pixel at the object": "1.04 units",
+    }
+    assert facts(scene, settings={"calibrated_lights": True})["Lights"].endswith("; taken from the capture&#x27;s calibration")
+    r = scene.reconstruction
+    fewer = Lights((r.lights.direction[0][:4], *r.lights.direction[1:]), (r.lights.intensity[0][:4], *r.lights.intensity[1:]), False)
+    told = facts(scene, lights=fewer, light_names=((1, 2, 3, 4), *r.light_names[1:]), settings={})
+    assert (told["Photographs"], told["Lights"]) == ("54", "4 to 10 a view: other ones in every view")
+
+
+@pytest.mark.parametrize(
+    ("component", "said"),
+    [
+        ({"name": "lobe", "kept": True, "gain": 0.135, "noise": 0.027}, "the error falls by 13 %, 5.0 standard errors"),
+        ({"name": "lobe", "kept": False, "gain": 0.01, "noise": 0.02}, "the error falls by 1 %, 0.5 standard errors: that may be chance"),
+        (
+            {"name": "lobe", "kept": False, "gain": 0.01, "noise": 0.001},
+            "the error falls by 1 % in the light or in shadow, and rises in the other",
+        ),
+        ({"name": "lobe", "kept": False, "gain": -0.1, "noise": 0.1}, "the error rises by 11 %, 1.0 standard errors"),
+        ({"name": "lobe", "kept": False, "gain": 0.0, "noise": 0.0}, "the error does not change"),
+        ({"name": "net: not tried, too little fits badly", "kept": False, "gain": 0.0, "noise": 0.0}, "not tried: too little fits badly"),
+        ({"name": "lobe", "kept": True}, ""),
+    ],
+)
+def test_why_a_component_stays_or_goes(component: dict[str, Any], said: str) -> None:
+    assert reason(component) == said
+    page = Page(_components([component, {"name": f"net{NOT_TRIED}far"}]))
+    assert said in page.text if said else "why" in page.text
+    assert page.text[-1] == "not tried: far" and "net" in page.text
+
+
+def test_sentences_have_room_on_a_phone() -> None:
+    html = _components([{"name": "lobe", "kept": False, "gain": 0.01, "noise": 0.02, "seconds": 1.0}])
+    assert '<th class="words">why</th>' in html and "<th>component</th>" in html and '<th class="number">time, s</th>' in html
+    assert ".words{min-width:" in STYLE
+
+
+def test_reasons_for_no_trial_are_told_apart_from_names() -> None:
+    """The page knows them by how they are written."""
+    assert NOT_TRIED in neural.NOT_TRIED and NOT_TRIED in Path(str(photometry.__file__)).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("missing", SECTIONS)
@@ -200,7 +282,7 @@ def test_views_and_lights_that_the_result_lacks_are_not_shown(scene: SphereScene
     html = report_html(fewer, scene.capture)
     assert re.findall(r"<h3>(.*?)</h3>", html) in (["view_01, light 7"], ["view_01, light 9"])
     none = report_html(fewer, Capture("others", scene.capture.views[1:]))
-    assert "<img" not in none and "Views" not in words(none) and "Lights" not in words(none)
+    assert "<img" not in none and "<h2>Views" not in none and "<h2>Lights" not in none and "Size of a photograph" not in none
 
 
 def test_pictures_show_what_they_say(scene: SphereScene) -> None:
@@ -232,7 +314,7 @@ def test_the_expected_error_is_that_of_the_confidence(scene: SphereScene) -> Non
 
 
 def test_chart_draws_the_values() -> None:
-    html = line_chart([4.0, 2.0, 1.0], "round", "residual")
+    html = line_chart([4.0, 2.0, 1.0], "123", "round", "residual")
     points = [tuple(map(float, p.split(","))) for p in re.findall(r'points="(.*?)"', html)[0].split()]
     heights = [y for _, y in points]
     base = 12 + (4.0 / 4.0) * (heights[0] - 12) if heights[0] > 12 else 12
@@ -241,7 +323,15 @@ def test_chart_draws_the_values() -> None:
     zero = 2 * heights[1] - heights[0]
     assert (zero - heights[2]) / (zero - heights[0]) == pytest.approx(0.25, abs=0.01)
     for values in ([1.0], [0.0, 0.0], [-1.0, 1.0]):
-        assert not Page(line_chart(values, "a", "b")).open
+        assert not Page(line_chart(values, ["<"] * len(values), "a", "b")).open
+
+
+def test_rounds_keep_their_numbers_in_the_chart() -> None:
+    html = _rounds([{"round": 1.0}, {"round": 2.0, "residual": 0.5}, {"round": 3.0, "residual": 0.25}])
+    ticks = dict(re.findall(r'<text x="([\d.]+)"[^>]*text-anchor="middle">(\d)</text>', html))
+    dots = re.findall(r'<circle cx="([\d.]+)"[^>]*><title>(.*?)</title>', html)
+    assert list(ticks.values()) == ["1", "2", "3"]
+    assert [(ticks[x], said) for x, said in dots] == [("2", "round 2: 0.5"), ("3", "round 3: 0.25")]
 
 
 def test_lights_lie_where_the_camera_sees_them() -> None:
@@ -249,6 +339,8 @@ def test_lights_lie_where_the_camera_sees_them() -> None:
     html = light_sphere(direction, np.ones((5, 3)), (1, 2, 3, 4, 5), "view_01")
     marks = {re.findall(r"light (\d)", m)[0]: m for m in re.findall(r'<circle class="light".*?</circle>', html)}
     assert 'cx="60.0" cy="-0.0"' in marks["1"] and 'cx="0.0" cy="-60.0"' in marks["2"] and "37 degrees" in marks["2"]
+    # White lights lie on a dark disc, the ring of 90 degrees.
+    assert html.index('r="100.0"') < html.index('r="86.6"') and ".ring:first-child{fill:#333}" in STYLE
     assert 'fill="none"' in marks["5"] and 'fill="none"' not in marks["4"]
 
 

@@ -24,16 +24,16 @@ from urllib.request import urlopen
 import cv2
 import numpy as np
 import pytest
-from sphere_scene import SphereScene, make_sphere
+from sphere_scene import RADIUS, SphereScene, colours, make_sphere
 
-import mvps.viewer
 from mvps.command import run
 from mvps.export import write_reconstruction
 from mvps.illumination import Illumination, environment_lights
 from mvps.layers import rendered
+from mvps.mesh import decimated, normalise
 from mvps.pbr import srgb_bytes
 from mvps.view import Model, main, named, server
-from mvps.viewer import packed, viewer_html
+from mvps.viewer import carried_over, packed, viewer_html
 from mvps.viewer.environments import MADE, made
 from mvps.viewpoints import look_at
 from mvps.visibility import RayCaster
@@ -73,9 +73,34 @@ def test_only_the_strongest_lobes_of_an_edited_material(scene: SphereScene) -> N
     assert about["sharpness"] == [1, 2, 3, 5]
 
 
-def test_a_model_that_is_too_large_is_named(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mvps.viewer, "LARGEST_BYTES", 1000)
-    html = viewer_html(scene.reconstruction.surface, scene.reconstruction.material, UP, FROM)
+def test_a_model_without_room_has_fewer_faces_and_says_so() -> None:
+    r = make_sphere(5, coloured_lobes=True).reconstruction
+    whole = viewer_html(r.surface, r.material, UP, FROM)
+    room = len(whole) - 100_000
+    html = viewer_html(r.surface, r.material, UP, FROM, room=room)
+    about = json.loads(re.search(r'id="viewer-about">(.*?)</script>', html)[1])  # type: ignore[index]
+    # Of what there is room for most is used, and the model is that large still.
+    assert room / 2 < len(html) <= room and about["faces"] < len(r.surface.faces)
+    assert f"room for {about['faces']:,} of the model's {len(r.surface.faces):,} faces; model.glb" in html and "faces; model" not in whole
+    np.testing.assert_allclose(np.array([about["low"], about["high"]]), [[-RADIUS] * 3, [RADIUS] * 3], rtol=0.02)
+
+
+def test_fewer_vertices_have_the_material_of_their_place() -> None:
+    r = make_sphere(4).reconstruction
+    material = replace(r.material, confidence=(r.surface.vertices[:, 2] / RADIUS + 1) / 2)
+    fewer = decimated(r.surface, 1000)
+    assert fewer is not None
+    carried = carried_over(r.surface, material, fewer.vertices)
+    np.testing.assert_allclose(carried.confidence, (fewer.vertices[:, 2] / RADIUS + 1) / 2, atol=0.01)
+    outward = normalise(fewer.vertices)
+    expected = normalise(outward + 0.1 * np.sin(fewer.vertices[:, [1, 2, 0]] / 8))
+    np.testing.assert_allclose(carried.normal, expected, atol=0.02)
+    away = np.abs(fewer.vertices[:, 0]) > 5
+    np.testing.assert_allclose(carried.albedo[away], colours(fewer.vertices)[away])
+
+
+def test_no_room_for_any_model(scene: SphereScene) -> None:
+    html = viewer_html(scene.reconstruction.surface, scene.reconstruction.material, UP, FROM, room=1000)
     assert "too large" in html and "<script" not in html
 
 

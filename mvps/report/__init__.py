@@ -3,7 +3,7 @@
 Sections whose numbers the metrics do not hold are left out. The metrics' layout:
 
     {"stages": [{"name", "seconds", "peak_memory_mb", "status"?}], "rounds": [{"round", "residual", ...}],
-     "status": {"name", "text"}, "model": {"components": [{"name", "kept", "gain", "seconds", "why"}]}, "truth": {name: number}}
+     "status": {"name", "text"}, "model": {"components": [{"name", "kept", "gain", "noise", "seconds"}]}, "truth": {name: number}}
 """
 
 from mvps.report.page import report_html, write_report

@@ -14,21 +14,21 @@ WIDTH, HEIGHT, LEFT, BOTTOM = 480, 220, 64, 34
 RADIUS = 100
 
 
-def line_chart(values: Sequence[float], across: str, up: str) -> str:
-    """One line through values at 1, 2, 3 ...; `across` and `up` name the axes."""
-    low, high = min(0.0, *values), max(0.0, *values)
+def line_chart(values: Sequence[float | None], names: Sequence[str], across: str, up: str) -> str:
+    """One line through values, of which one at least is known, at their names' places; `across` and `up` name the axes."""
+    places = np.linspace(LEFT, WIDTH - 12, len(values)) if len(values) > 1 else np.array([(LEFT + WIDTH) / 2])
+    known = [(x, v, name) for x, v, name in zip(places.tolist(), values, names, strict=True) if v is not None]
+    low, high = min(0.0, *(v for _, v, _ in known)), max(0.0, *(v for _, v, _ in known))
     span = (high - low) or 1.0
-    x = np.linspace(LEFT, WIDTH - 12, len(values)) if len(values) > 1 else np.array([(LEFT + WIDTH) / 2])
-    y = [12 + (high - v) / span * (HEIGHT - 12 - BOTTOM) for v in values]
-    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True))
-    dots = "".join(
-        f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.5"><title>{v:.4g}</title></circle>' for a, b, v in zip(x, y, values, strict=True)
-    )
+    marks = [(x, 12 + (high - v) / span * (HEIGHT - 12 - BOTTOM), f"{across} {name}: {v:.4g}") for x, v, name in known]
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y, _ in marks)
+    dots = "".join(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="3.5"><title>{escape(said)}</title></circle>' for x, y, said in marks)
     every = -(-len(values) // 10)
     ticks = "".join(
-        f'<text x="{a:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{k + 1}</text>' for k, a in enumerate(x) if k % every == 0
+        f'<text x="{x:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">{escape(name)}</text>'
+        for x, name in list(zip(places, names, strict=True))[::every]
     )
-    base, label = HEIGHT - BOTTOM, f"{up} over {across}: " + ", ".join(f"{v:.4g}" for v in values)
+    base, label = HEIGHT - BOTTOM, f"{up}, " + ", ".join(said for _, _, said in marks)
     return (
         f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">'
         f'<path class="axis" d="M{LEFT - 8} 8V{base}H{WIDTH - 4}"/>'
@@ -74,7 +74,8 @@ def light_sphere(direction: Float, intensity: Float, numbers: Sequence[int], nam
 
     A light behind the object (z < 0) is drawn hollow.
     """
-    rings = "".join(f'<circle class="ring" r="{RADIUS * np.sin(np.radians(angle)):.1f}"/>' for angle in (30, 60, 90))
+    # The outermost first: it is the dark ground on which white lights are told from hollow ones.
+    rings = "".join(f'<circle class="ring" r="{RADIUS * np.sin(np.radians(angle)):.1f}"/>' for angle in (90, 60, 30))
     brightness = intensity.mean(1) / max(float(intensity.mean()), 1e-12)
     marks = []
     for k in np.argsort(direction[:, 2], kind="stable"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -14,12 +15,19 @@ from mvps.folders import write_whole
 from mvps.rendering import light_senders
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.pictures import data_address, view_pictures
+from mvps.report.words import NOT_TRIED, captured, is_number, reason, without_held_out
 from mvps.scene import Capture, Reconstruction, View
 from mvps.viewer import STYLE as VIEWER_STYLE
 from mvps.viewer import viewer_html
 from mvps.visibility import ray_caster
 
 VIEWS_SHOWN = 4
+
+LONG = 20
+"""Letters of a cell that stand on several lines."""
+
+LARGEST_BYTES = 15_000_000
+"""Of a page, so that it can be sent on: the model gets what its pictures and tables leave."""
 
 ENLARGE = """
 for(const button of document.querySelectorAll(".enlarge"))button.addEventListener("click",()=>{
@@ -39,13 +47,15 @@ h1{margin:.2em 0}h2{margin:2em 0 .5em;border-bottom:1px solid var(--line)}
 .enlarge{display:block;width:100%;padding:0;border:0;background:none;cursor:zoom-in}.large .enlarge{cursor:zoom-out}
 figure{margin:0}figure img{width:100%;height:auto;display:block}.grid .large img{height:90vh;object-fit:contain}figcaption{font-size:.85rem}
 .spheres{grid-template-columns:repeat(auto-fill,minmax(12rem,1fr))}.sphere{max-width:20rem}
+code{white-space:nowrap}
+.facts{display:grid;grid-template-columns:fit-content(40%) 1fr;gap:.25rem 1.2rem;margin:0}.facts dt{font-weight:600}.facts dd{margin:0}
 .wide{overflow-x:auto}table{border-collapse:collapse;min-width:min(100%,24rem)}
 th,td{text-align:left;padding:.25em .8em .25em 0;border-bottom:1px solid var(--line);vertical-align:top}
-.number{text-align:right;font-variant-numeric:tabular-nums}
+.number{text-align:right;font-variant-numeric:tabular-nums}.words{min-width:8rem}
 .bar{display:inline-block;height:.7em;background:var(--mark)}
 svg{width:100%;max-width:30rem;height:auto;font-size:12px}svg text{fill:currentColor}
-.axis,.ring{fill:none;stroke:var(--line)}.line{fill:none;stroke:var(--mark);stroke-width:2}.dots{fill:var(--mark)}
-.light{stroke:#777;stroke-width:1}
+.axis{fill:none;stroke:var(--line)}.ring{fill:none;stroke:#888}.ring:first-child{fill:#333}.line{fill:none;stroke:var(--mark);stroke-width:2}.dots{fill:var(--mark)}
+.light{stroke:#aaa;stroke-width:1}
 pre{background:var(--soft);padding:.8em;overflow-x:auto;font-size:.85rem}
 """
 
@@ -62,9 +72,9 @@ def write_report(reconstruction: Reconstruction, capture: Capture, path: Path) -
 def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
     """The page as text. Views and lights of the capture that the reconstruction does not hold are left out of the pictures."""
     metrics = reconstruction.metrics
+    heading = _heading(reconstruction, capture)
     sections = [
-        _heading(reconstruction, capture),
-        _viewer(reconstruction, capture),
+        _captured(reconstruction, capture),
         _findings(metrics.get("findings") or []),
         _signs(metrics.get("status") or {}, metrics.get("held_out") or {}),
         _pictures(reconstruction, capture),
@@ -75,7 +85,12 @@ def report_html(reconstruction: Reconstruction, capture: Capture) -> str:
         _stages(metrics.get("stages") or []),
         _settings(reconstruction.settings),
     ]
-    title = escape(f"Reconstruction of {capture.name}")
+    room = LARGEST_BYTES - len(_page(capture.name, [heading, *sections]).encode())
+    return _page(capture.name, [heading, _viewer(reconstruction, capture, room), *sections])
+
+
+def _page(name: str, sections: Sequence[str]) -> str:
+    title = escape(f"Reconstruction of {name}")
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -99,11 +114,10 @@ def _shown(value: Any) -> str:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
-    """A table; numbers stand to the right. All cells but _Html are escaped."""
-    numeric = [any(_is_number(row[k]) for row in rows) for k in range(len(head))]
+    """A table; numbers stand to the right, and sentences have room on a phone. All cells but _Html are escaped."""
+    kinds = [_kind([row[k] for row in rows]) for k in range(len(head))]
 
     def cells(tag: str, values: Sequence[Any]) -> str:
-        kinds = [' class="number"' if right else "" for right in numeric]
         texts = [value.html if isinstance(value, _Html) else escape(_shown(value)) for value in values]
         return "<tr>" + "".join(f"<{tag}{kind}>{text}</{tag}>" for kind, text in zip(kinds, texts, strict=True)) + "</tr>"
 
@@ -111,15 +125,17 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return f'<div class="wide"><table><thead>{cells("th", head)}</thead><tbody>{body}</tbody></table></div>'
 
 
+def _kind(column: Sequence[Any]) -> str:
+    if any(is_number(value) for value in column):
+        return ' class="number"'
+    return ' class="words"' if any(isinstance(value, str) and len(value) > LONG for value in column) else ""
+
+
 class _Html:
     """Text that is HTML already."""
 
     def __init__(self, html: str) -> None:
         self.html = html
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def _columns(records: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> str:
@@ -131,12 +147,11 @@ def _columns(records: Sequence[Mapping[str, Any]], names: Mapping[str, str]) -> 
 def _heading(reconstruction: Reconstruction, capture: Capture) -> str:
     surface, metrics = reconstruction.surface, reconstruction.metrics
     photographs = sum(map(len, reconstruction.light_names))
-    rig = "stand still in the camera's frame" if reconstruction.lights.one_rig else "differ between views"
     facts = [
-        f"{len(surface.vertices):,} vertices and {len(surface.faces):,} faces from {len(reconstruction.views)} views with"
-        f" {photographs} photographs; the lights {rig}."
+        f"{len(surface.vertices):,} vertices and {len(surface.faces):,} faces from {len(reconstruction.views):,} views with"
+        f" {photographs:,} photographs."
     ]
-    seconds = [stage["seconds"] for stage in metrics.get("stages") or [] if _is_number(stage.get("seconds"))]
+    seconds = [stage["seconds"] for stage in metrics.get("stages") or [] if is_number(stage.get("seconds"))]
     if seconds:
         facts.append(f"{sum(seconds):.1f} s in all.")
     status = metrics.get("status") or {}
@@ -145,13 +160,19 @@ def _heading(reconstruction: Reconstruction, capture: Capture) -> str:
     return f"<h1>{escape(capture.name)}</h1>\n<p>{escape(' '.join(facts))}</p>\n{outcome}"
 
 
-def _viewer(reconstruction: Reconstruction, capture: Capture) -> str:
-    """The model to turn and to light, as the first known view's camera sees it."""
+def _viewer(reconstruction: Reconstruction, capture: Capture, room: int) -> str:
+    """The model to turn and to light, as the first known view's camera sees it, in `room` bytes."""
     views = _known_views(reconstruction, capture)
     if not views:
         return ""
     rotation = views[0].camera.rotation
-    return _section("Model", viewer_html(reconstruction.surface, reconstruction.material, -rotation[1], -rotation[2]))
+    return _section("Model", viewer_html(reconstruction.surface, reconstruction.material, -rotation[1], -rotation[2], room=room))
+
+
+def _captured(reconstruction: Reconstruction, capture: Capture) -> str:
+    facts = captured(reconstruction, [view for view in capture.views if view.name in reconstruction.views])
+    rows = "".join(f"<dt>{escape(name)}</dt><dd>{escape(words)}</dd>" for name, words in facts)
+    return _section("Capture", f'<dl class="facts">{rows}</dl><p>Units of length are those of the capture\'s cameras.</p>')
 
 
 def _findings(findings: Sequence[Mapping[str, Any]]) -> str:
@@ -181,9 +202,11 @@ HELD_OUT = {
 
 def _signs(status: Mapping[str, Any], held_out: Mapping[str, Any]) -> str:
     """By what the result was judged, without knowing the truth, and what photographs that were held back say of it."""
-    rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if _is_number(status.get(key))]
-    rows += [(what, held_out[key], "dB") for key, what in HELD_OUT.items() if _is_number(held_out.get(key))]
-    return _section("How good", _table(["sign", "value", ""], rows)) if rows else ""
+    rows = [(what, factor * status[key], unit) for key, (what, factor, unit) in SIGNS.items() if is_number(status.get(key))]
+    rows += [(what, held_out[key], "dB") for key, what in HELD_OUT.items() if is_number(held_out.get(key))]
+    # Options stay in one piece where lines break.
+    instead = re.sub("(--[a-z-]+)", r"<code>\1</code>", escape(without_held_out(status)))
+    return _section("How good", _table(["sign", "value", "unit"], rows) + ("" if held_out else f"<p>{instead}</p>")) if rows else ""
 
 
 def _known_views(reconstruction: Reconstruction, capture: Capture) -> list[View]:
@@ -239,17 +262,22 @@ ROUND_COLUMNS = {
 def _rounds(rounds: Sequence[Mapping[str, Any]]) -> str:
     if not rounds:
         return ""
-    residuals = [float(r["residual"]) for r in rounds if _is_number(r.get("residual"))]
-    chart = line_chart(residuals, "round", "residual") if residuals else ""
+    residuals = [r["residual"] if is_number(r.get("residual")) else None for r in rounds]
+    names = [_shown(r.get("round")) for r in rounds]
+    chart = line_chart(residuals, names, "round", "residual") if any(value is not None for value in residuals) else ""
     return _section("Rounds", chart + _columns(rounds, ROUND_COLUMNS))
 
 
 def _components(components: Sequence[Mapping[str, Any]]) -> str:
-    names = {"name": "component", "kept": "kept", "gain": "gain", "noise": "its standard error", "seconds": "time, s", "why": "why"}
     if not components:
         return ""
-    said = "<p>A component stays if it lowers the error on held-out lights (gain, as a share of it) by more than three standard errors.</p>"
-    return _section("Reflectance model", said + _columns(components, names))
+    rows = [{**c, "name": str(c.get("name", "")).partition(NOT_TRIED)[0], "why": reason(c)} for c in components]
+    names = {"name": "component", "kept": "kept", "why": "why", "seconds": "time, s"}
+    said = (
+        "<p>While the model is chosen, some lights of every view are kept back. A component stays if it lowers the error on them by more"
+        " than three standard errors.</p>"
+    )
+    return _section("Reflectance model", said + _columns(rows, names))
 
 
 def _truth(truth: Mapping[str, Any]) -> str:
@@ -263,10 +291,10 @@ def _truth(truth: Mapping[str, Any]) -> str:
 def _stages(stages: Sequence[Mapping[str, Any]]) -> str:
     if not stages:
         return ""
-    longest = max((s["seconds"] for s in stages if _is_number(s.get("seconds"))), default=0) or 1
+    longest = max((s["seconds"] for s in stages if is_number(s.get("seconds"))), default=0) or 1
     shown = [
         {**s, "bar": _Html(f'<span class="bar" style="width:{6 * s["seconds"] / longest:.2f}rem"></span>')}
-        if _is_number(s.get("seconds"))
+        if is_number(s.get("seconds"))
         else s
         for s in stages
     ]

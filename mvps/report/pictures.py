@@ -18,8 +18,11 @@ from mvps.scene import Bool, Float, Reconstruction, View, expected_error_deg
 from mvps.visibility import RayCaster
 
 LARGEST_SIDE = 800
-"""Pixels of a picture: as wide as a page when it is enlarged, and 32 of them, 0.15 MB each, stay below the 15 MB that a page may have."""
-JPEG_QUALITY = 85
+"""Pixels of a picture: as wide as a page when it is enlarged."""
+JPEG_QUALITIES = (85, 70, 50, 30, 20, 10)
+"""The first that LARGEST_BYTES allow is taken: nothing but grain has half a megabyte at 85 and an eighth at 20."""
+LARGEST_BYTES = 200_000
+"""Of a picture: 32 of them in base64 leave nearly half of a page to the model."""
 ERROR_SPAN = 0.25
 """Error that is drawn brightest, as a share of the photograph's white."""
 EXPECTED_SPAN = 20.0
@@ -81,7 +84,11 @@ def view_pictures(caster: RayCaster, senders: Senders | None, reconstruction: Re
 
 def data_address(image: NDArray[np.uint8]) -> str:
     """The picture (height, width, 3) RGB as a JPEG inside an address of its own (RFC 2397)."""
-    data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+    bgr = np.ascontiguousarray(image[..., ::-1])
+    for quality in JPEG_QUALITIES:
+        data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(data) <= LARGEST_BYTES:
+            break
     return "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
 
 

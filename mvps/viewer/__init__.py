@@ -21,6 +21,7 @@ import base64
 import json
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -29,13 +30,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.mesh import decimated, nearest, normalise
 from mvps.scene import Float, Material, Surface
+from mvps.visibility import Hits, interpolate
 
 MOST_LOBES = 4
 """As many as a vertex attribute holds; the model chooses from three."""
 
-LARGEST_BYTES = 9_000_000
-"""Of the compressed data: a page of 15 MB holds a third more in base64 and the pictures besides."""
+AROUND_BYTES = 10_000
+"""At most, of the part: what is neither the program nor the model's arrays."""
+
+LEAST_FACES = 4
+"""Of a body that is closed: with fewer there is nothing to show."""
 
 
 @cache
@@ -89,6 +95,31 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
     return about, zlib.compress(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), 6)
 
 
+def carried_over(surface: Surface, material: Material, points: Float) -> Material:
+    """The material at the places of the surface nearest to points (n, 3), without its neural residual, which the viewer does not show."""
+    distance, _, face, barycentric = nearest(surface, points)
+    hits = Hits(face, barycentric, distance)
+    normal, albedo, weight, confidence = (
+        interpolate(surface, hits, values) for values in (material.normal, material.albedo, material.specular_weight, material.confidence)
+    )
+    # Normals that cancel leave none: one of the corners' serves as well.
+    normal = np.where(normal.any(1, keepdims=True), normal, material.normal[surface.faces[face, 0]])
+    return replace(material, normal=normalise(normal), albedo=albedo, specular_weight=weight, confidence=confidence, residual=None)
+
+
+def packed_within(surface: Surface, material: Material, most: int) -> tuple[dict[str, Any], bytes] | None:
+    """`packed`, with as few faces as arrays of `most` bytes ask for. None where that cannot be had (mvps.mesh.decimated)."""
+    about, data = packed(surface, material)
+    faces = len(surface.faces)
+    while len(data) > most:
+        faces = int(faces * 0.95 * max(most, 0) / len(data))
+        fewer = decimated(surface, faces) if faces >= LEAST_FACES else None
+        if fewer is None:
+            return None
+        about, data = packed(fewer, carried_over(surface, material, fewer.vertices))
+    return about, data
+
+
 def _options(names: Sequence[str]) -> str:
     return "".join(f"<option>{escape(name)}</option>" for name in names)
 
@@ -124,16 +155,23 @@ def viewer_html(
     served: bool = False,
     environments: Sequence[str] = (),
     materials: Sequence[str] = (),
+    room: int | None = None,
 ) -> str:
     """The part of a page; up, looking_from (3,): upwards and towards the first camera, world frame. served: visibility is asked of the
-    server that the page came from, and environments and other materials, by their names; the first of these is `material`. A sentence in
-    its place where the model is too large for a page."""
-    about, data = packed(surface, material)
-    if len(data) > LARGEST_BYTES and not served:
-        return f"<p>The model of {len(surface.vertices):,} vertices is too large for this page; model.glb shows it.</p>"
+    server that the page came from, and environments and other materials, by their names; the first of these is `material`. room: bytes
+    that the part may take, any number if None; a model that needs more is shown with fewer faces, and a line says so."""
+    # Base64 has four letters for three bytes.
+    most = None if room is None else (room - AROUND_BYTES - len(program().encode())) * 3 // 4
+    model = packed(surface, material) if most is None else packed_within(surface, material, most)
+    if model is None:
+        return f"<p>The model of {len(surface.faces):,} faces is too large for this page; model.glb shows it.</p>"
+    about, data = model
     about |= {"up": np.asarray(up).tolist(), "from": np.asarray(looking_from).tolist(), "served": served}
+    fewer = ""
+    if about["faces"] < len(surface.faces):
+        fewer = f"<p>The page has room for {about['faces']:,} of the model's {len(surface.faces):,} faces; model.glb shows all of them.</p>"
     return (
-        '<div class="viewer"><canvas id="viewer" tabindex="0" aria-label="The model: drag to turn it, drag with the right button or'
+        f'{fewer}<div class="viewer"><canvas id="viewer" tabindex="0" aria-label="The model: drag to turn it, drag with the right button or'
         ' with Shift to move the light, scroll to come closer; arrow keys turn it, with Shift they move the light"></canvas>'
         + ('<img id="viewer-exact" alt="" hidden>' if served else "")
         + _controls(environments, materials)
