@@ -180,6 +180,7 @@ def test_wrong_edits_are_refused(edit: dict[str, Any], said: str) -> None:
         ("", "wanted JSON"),
         ("[" * 100000, "wanted JSON"),
         ('{"edits": [1e999]}', "wanted JSON, .* not finite"),
+        (f'{{"edits": [{"9" * 5000}]}}', r"wanted JSON, .*the number 9{20}[.]{3}, of 5000 digits\);"),
         ("{}", "wanted .* given {}"),
         ("[]", r"wanted .* given \[\]"),
         ('{"edits": 3}', "wanted .* given"),
