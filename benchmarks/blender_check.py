@@ -10,7 +10,9 @@ module (pip install bpy). Writes blender.md beside this file.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ import cv2
 import numpy as np
 from glb import Array, read_glb
 
+from mvps.command import run
 from mvps.compare.tables import as_markdown
 from mvps.export import read_reconstruction
 from mvps.illumination import Illumination, frame_of
@@ -120,12 +123,12 @@ def compared(result: Path, capture: Path, folder: Path) -> tuple[list[float], li
     return found, shown
 
 
-def main() -> None:
+def main(argv: Sequence[str]) -> None:
     """The command line."""
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     made.add_argument("paths", nargs="+", type=Path, metavar="RESULT CAPTURE")
     made.add_argument("--pictures", type=Path, metavar="DIR", help="ours, Blender's, four times their difference")
-    given = made.parse_args()
+    given = made.parse_args(argv)
     if len(given.paths) % 2:
         made.error("wanted pairs of a result and its capture, given an odd number of folders")
     lines = [["result", "views", "against ours, dB", "worst"]]
@@ -147,4 +150,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main))

@@ -9,6 +9,8 @@ mvps[mitsuba].
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,11 +19,12 @@ from glb import Array, Model, read_glb
 from mitsuba_check import photographs, pictured, psnr
 from mitsuba_scene import mesh, render, sensor
 
+from mvps.command import run
 from mvps.compare.tables import as_markdown
 from mvps.export import read_reconstruction
 from mvps.load import read_capture, read_truth
 from mvps.measures import surface_errors
-from mvps.scene import Capture, Reconstruction, Surface
+from mvps.scene import Capture, CaptureError, Reconstruction, Surface
 
 HERE = Path(__file__).resolve().parent
 HEAD = ("model", "faces", "MB", "inside, dB", "with outlines, dB", "without normal map, dB", "photographs, dB")
@@ -60,10 +63,14 @@ def gap(pictures: list[Picture], of_full: list[Picture], outlines: bool = False)
 
 def lines(folder: Path, capture: Path) -> list[list[str]]:
     """The table: the full model, then the others by their numbers of faces."""
-    result, whole = read_reconstruction(folder), read_capture(capture, lights=[1])
+    result, files = read_reconstruction(folder), sorted(folder.glob("model*.glb"), key=lambda file: -len(read_glb(file).faces))
+    if not files:
+        raise CaptureError(
+            f"{folder}: wanted a result with a model.glb, given one without; give the folder that mvps.reconstruct --out wrote"
+        )
+    whole = read_capture(capture, lights=[1])
     chosen, truth = photographs(result, capture), read_truth(capture).surface
     photographed = [(pictured(view, k), view.mask) for view in chosen.views for k in range(len(view.lights))]
-    files = sorted(folder.glob("model*.glb"), key=lambda file: -len(read_glb(file).faces))
     of_full, rows = shown(result, read_glb(files[0]), chosen), []
     for file in files:
         model = read_glb(file)
@@ -80,12 +87,12 @@ def lines(folder: Path, capture: Path) -> list[list[str]]:
     return rows
 
 
-def main() -> None:
+def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("result", type=Path)
     parser.add_argument("capture", type=Path)
-    given = parser.parse_args()
+    given = parser.parse_args(argv)
     table = as_markdown([[*HEAD, *TAIL], *lines(given.result, given.capture)])
     text = f"`python benchmarks/levels.py RESULT CAPTURE`, {given.result.name}: levels of detail.\n\n{table}\n\n{NOTE}\n"
     (HERE / "levels.md").write_text(text, encoding="utf-8")
@@ -93,4 +100,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main))

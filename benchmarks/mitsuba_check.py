@@ -10,7 +10,8 @@ none were held out, in up to VIEWS views. Writes mitsuba.md beside this file; ne
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from glb import Array, Model, read_glb, reflected, tangent_gap_deg
 from mitsuba_scene import mesh, render, sensor
 
 from mvps.camera import view_directions
+from mvps.command import run
 from mvps.compare.tables import as_markdown
 from mvps.export import read_reconstruction
 from mvps.illumination import Illumination
@@ -155,12 +157,12 @@ HEAD = ("result", "faces", "photographs", "against ours, dB", "others off, dB", 
 TAIL = ("ours against photographs, dB", "Mitsuba against photographs, dB", "lobes, %", "reflectance, %", "tangents, deg")
 
 
-def main() -> None:
+def main(argv: Sequence[str]) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("paths", nargs="+", type=Path, metavar="RESULT CAPTURE")
     parser.add_argument("--pictures", type=Path, help="folder for photographs, renderings and their differences side by side")
-    given = parser.parse_args()
+    given = parser.parse_args(argv)
     if len(given.paths) % 2:
         parser.error("wanted pairs of a result and its capture, given an odd number of folders")
     pairs = zip(given.paths[::2], given.paths[1::2], strict=True)
@@ -171,4 +173,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(run(main))

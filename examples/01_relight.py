@@ -4,31 +4,35 @@ python examples/01_relight.py RESULT CAPTURE picture.png
 """
 
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from mvps.command import run
 from mvps.export import read_reconstruction
 from mvps.illumination import Illumination
 from mvps.layers import rendered
 from mvps.load import read_capture
 from mvps.pbr import srgb_bytes, white_level
+from mvps.scene import CaptureError
+from mvps.texture import png_bytes
 from mvps.visibility import RayCaster
 
 FINER = 3
 """Pixels of the picture to one of the photograph's."""
 
 
-def main(result: str, capture: str, out: str) -> None:
+def main(argv: Sequence[str]) -> None:
+    if len(argv) != 3:
+        raise CaptureError(f"wanted RESULT CAPTURE picture.png, given {len(argv)} arguments")
+    result, capture, out = argv
     reconstruction = read_reconstruction(Path(result))
     view = read_capture(capture).views[0]
     camera = replace(
-        view.camera,
-        K=np.diag([FINER, FINER, 1.0]) @ view.camera.K,
-        height=FINER * view.camera.height,
-        width=FINER * view.camera.width,
+        view.camera, K=np.diag([FINER, FINER, 1.0]) @ view.camera.K, height=FINER * view.camera.height, width=FINER * view.camera.width
     )
     # A light from the upper right, halfway to the camera. Camera axes: x right, y down, z forward.
     direction = np.array([[1.0, -1.0, -1.0]]) / np.sqrt(3) @ camera.rotation
@@ -48,8 +52,8 @@ def main(result: str, capture: str, out: str) -> None:
     box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
     paper = 255 * (1 - coverage[..., None])
     shown = [np.rint(x * coverage[..., None] + paper)[box].astype(np.uint8) for x in (photo, normals, albedo, relit)]
-    cv2.imwrite(out, np.concatenate(shown, 1)[..., ::-1])
+    Path(out).write_bytes(png_bytes(np.concatenate(shown, 1)))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:4])
+    sys.exit(run(main))

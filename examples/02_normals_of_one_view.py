@@ -4,17 +4,24 @@ python examples/02_normals_of_one_view.py CAPTURE picture.png
 """
 
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 
-import cv2
 import numpy as np
 
+from mvps.command import run
 from mvps.export import normal_picture
 from mvps.load import read_capture
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
+from mvps.scene import CaptureError
+from mvps.texture import png_bytes
 
 
-def main(path: str, out: str) -> None:
+def main(argv: Sequence[str]) -> None:
+    if len(argv) != 2:
+        raise CaptureError(f"wanted CAPTURE picture.png, given {len(argv)} arguments")
+    path, out = argv
     capture = read_capture(path, views=[1])
     result = reconstruct(capture, Settings(path, preset="draft"), None, Progress())
     print(result.metrics["status"]["text"])
@@ -25,8 +32,8 @@ def main(path: str, out: str) -> None:
     photograph[view.mask] = view.radiance().mean(1)
     photograph = np.rint(255 * np.clip(photograph / photograph.max(), 0, 1) ** (1 / 2.2)).astype(np.uint8)
     normals = result.normal_maps[0] @ view.camera.rotation.T * (1, -1, -1)
-    cv2.imwrite(out, np.concatenate([photograph, normal_picture(normals)], 1)[..., ::-1])
+    Path(out).write_bytes(png_bytes(np.concatenate([photograph, normal_picture(normals)], 1)))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:3])
+    sys.exit(run(main))

@@ -4,20 +4,26 @@ python examples/03_reconstruct.py CAPTURE RESULT picture.png
 """
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from mvps.command import run
 from mvps.load import read_capture
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct, write
 from mvps.render import render_view
+from mvps.scene import CaptureError
 from mvps.sound import sound
+from mvps.texture import png_bytes
 from mvps.visibility import RayCaster
 
 
-def main(path: str, result: str, out: str) -> None:
+def main(argv: Sequence[str]) -> None:
+    if len(argv) != 3:
+        raise CaptureError(f"wanted CAPTURE RESULT picture.png, given {len(argv)} arguments")
+    path, result, out = argv
     progress = Progress()
     settings = Settings(path, preset="draft", hold_out_lights=(2,))
 
@@ -36,8 +42,8 @@ def main(path: str, result: str, out: str) -> None:
     photograph[view.mask] = view.radiance([1])[:, 0]
     predicted, _ = render_view(RayCaster(reconstruction.surface), reconstruction, view.name, view.camera)
     both = np.concatenate([photograph, predicted[:, :, 1] / 65535], 1)
-    cv2.imwrite(out, np.rint(255 * np.clip(both / both.max(), 0, 1) ** (1 / 2.2)).astype(np.uint8)[..., ::-1])
+    Path(out).write_bytes(png_bytes(np.rint(255 * np.clip(both / both.max(), 0, 1) ** (1 / 2.2)).astype(np.uint8)))
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:4])
+    sys.exit(run(main))

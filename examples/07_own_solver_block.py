@@ -7,17 +7,24 @@ python examples/07_own_solver_block.py picture.png
 """
 
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 
+from mvps.command import run
+from mvps.scene import CaptureError
+from mvps.texture import png_bytes
 from solvers.least_squares import bounded_step
 
 POINTS, SAMPLES, NOISE = 4000, 24, 0.01
 
 
-def main(out: str) -> None:
+def main(argv: Sequence[str]) -> None:
+    if len(argv) != 1:
+        raise CaptureError(f"wanted picture.png, given {len(argv)} arguments")
+    (out,) = argv
     generator = torch.Generator().manual_seed(0)
     cosine = torch.rand(POINTS, SAMPLES, generator=generator)
     truth = torch.rand(POINTS, 2, generator=generator) * torch.tensor([1.0, 0.5])
@@ -41,9 +48,9 @@ def main(out: str) -> None:
     picture = np.full((300, 600, 3), 255, np.uint8)
     for k, span in enumerate((1.0, 0.5)):
         place = (300 * torch.stack([truth[:, k], x[:, k]], 1) / span).clamp(0, 299).long().numpy()
-        picture[299 - place[:, 1], 300 * k + place[:, 0]] = (180, 80, 30)
-    cv2.imwrite(out, picture)
+        picture[299 - place[:, 1], 300 * k + place[:, 0]] = (30, 80, 180)
+    Path(out).write_bytes(png_bytes(picture))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    sys.exit(run(main))

@@ -3,7 +3,7 @@
     {"edits": [{"region": ..., "albedo": ..., "specular": ..., "preset": ...}, ...]}      applied one after the other
 
     region    left out: everything;  {"view": "view_04", "mask": "painted.png"}: what that camera sees of the mask's white;
-              {"cluster": 1, "of": 3}: a kind of material, kinds being found from the shares of the lobes, 1 the least glossy
+              {"cluster": 1, "of": 3}: a kind of material, 1 the least glossy, kinds being found from the lobes' shares before any edit
     albedo    {"colour": [r, g, b]} linear, instead of the object's own;  {"factor": 0.8} or a factor per channel;  {"hue_deg": 30};
               {"painted": "view_04.png", "view": "view_04"}: what that camera sees takes the picture's colours, but for its clear parts
     specular  {"factor": 2} of the weights,  {"sharpness_factor": 4} of the lobes' sharpness, highlights keeping their energy
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import colorsys
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,8 @@ import numpy as np
 from scipy.cluster.vq import kmeans2
 
 from mvps.camera import project
-from mvps.load.images import read_mask, read_painting
+from mvps.inputs import JSON_LIMIT, parsed_json, read_file
+from mvps.load.images import read_painting
 from mvps.mesh import edges
 from mvps.pbr import linear_of_srgb, reflectance_scale
 from mvps.scene import Bool, Camera, CaptureError, Float, Int, Material, Surface
@@ -46,69 +48,97 @@ VOTES = 3
 """Votes of neighbours on a vertex's kind: noise of single vertices and of pairs goes, what is three edges wide stays."""
 
 KEYS = {"region", "albedo", "specular", "preset"}
-REGION_KEYS = ({"view", "mask"}, {"cluster", "of"})
+EITHER: Mapping[str, Sequence[set[str]]] = {"region": ({"view", "mask"}, {"cluster", "of"}), "albedo": ({"painted", "view"},)}
+SOME_OF: Mapping[str, set[str]] = {"albedo": {"colour", "factor", "hue_deg"}, "specular": {"factor", "sharpness_factor"}}
+"""What a part of an edit has: all of one of these sets, or some of that set."""
 
 LARGEST = 1e6
 """Of a factor: the brightest light has as many times the radiance of the darkest shadow that photographs tell."""
 
+MOST_KINDS = 16
+"""Of material, that edits may tell apart."""
+
 
 def read_edits(path: Path) -> list[dict[str, Any]]:
-    """The edits of a file, masks' paths made absolute. CaptureError where it holds anything else."""
+    """The edits of a file, pictures' paths made absolute, each with the path as "file". CaptureError where it holds anything else."""
     try:
-        given = json.loads(path.read_bytes())
-        edits = given["edits"]
-        if set(given) != {"edits"}:
-            raise ValueError(f"beside edits also {', '.join(sorted(set(given) - {'edits'}))}")
-        if not isinstance(edits, list) or not all(isinstance(one, dict) and set(one) <= KEYS for one in edits):
-            raise ValueError(f"each edit has some of {', '.join(sorted(KEYS))}")
+        given = parsed_json(read_file(path, JSON_LIMIT))
     except OSError as error:
-        raise CaptureError(f"{path}: wanted a file of edits, given {error.strerror}; check the path") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise CaptureError(f'{path}: wanted {{"edits": [...]}}, given something else ({error}); see docs/edits.md') from error
-    for one in edits:
+        raise CaptureError(f"{path}: wanted a file of edits, given one that cannot be read ({error.strerror}); check the path") from None
+    except ValueError as error:
+        raise CaptureError(f"{path}: wanted JSON, given text that is none ({error}); see docs/edits.md") from None
+    if not isinstance(given, dict) or set(given) != {"edits"} or not isinstance(given["edits"], list):
+        raise CaptureError(f'{path}: wanted {{"edits": [...]}}, given {_said(given)}; see docs/edits.md')
+    edits = []
+    for number, one in enumerate(given["edits"], 1):
+        if not isinstance(one, dict) or not set(one) <= KEYS:
+            raise CaptureError(f"{path}: edit {number}: wanted some of {', '.join(sorted(KEYS))}, given {_said(one)}; see docs/edits.md")
+        edits.append(one | {"file": str(path)})
         for part, key in (("region", "mask"), ("albedo", "painted")):
             named = one.get(part)
             if isinstance(named, dict) and isinstance(named.get(key), str):
-                one[part] = named | {key: str(path.parent / named[key])}
+                edits[-1][part] = named | {key: str(path.parent / named[key])}
     return edits
 
 
 def edited(surface: Surface, material: Material, edits: Sequence[Mapping[str, Any]], cameras: Mapping[str, Camera]) -> Material:
     """The material after the edits. cameras: by the names that regions give as views. CaptureError about what an edit gets wrong."""
+    # What an edit has made of a kind of material must not decide what the next one takes for that kind.
+    reconstructed = material
     for number, edit in enumerate(edits, 1):
+        where = f"{edit['file']}: edit {number}" if "file" in edit else f"edit {number}"
         try:
-            chosen = region_of(surface, material, edit.get("region"), cameras)
-            if "preset" in edit:
-                material = with_preset(material, chosen, edit["preset"])
-            if "painted" in edit.get("albedo", {}):
-                material = with_painted(surface, material, chosen, cameras, **edit["albedo"])
-            elif "albedo" in edit:
-                material = with_albedo(material, chosen, **edit["albedo"])
-            if "specular" in edit:
-                material = with_specular(material, chosen, **edit["specular"])
-        except (TypeError, ValueError, KeyError) as error:
-            if isinstance(error, CaptureError):
-                raise
-            raise CaptureError(
-                f"edit {number}: wanted what docs/edits.md lists, given something else ({error}); correct the file"
-            ) from error
+            chosen = region_of(surface, reconstructed, _part(edit, "region"), cameras)
+            material = _changed(surface, material, chosen, edit, cameras)
+        except CaptureError as error:
+            # About a picture, with what to try.
+            raise CaptureError(f"{where}: {error}") from error
+        except ValueError as error:
+            raise CaptureError(f"{where}: {error}; see docs/edits.md") from error
     return material
 
 
-def region_of(surface: Surface, material: Material, region: Any, cameras: Mapping[str, Camera]) -> Bool:
+def _changed(surface: Surface, material: Material, chosen: Bool, edit: Mapping[str, Any], cameras: Mapping[str, Camera]) -> Material:
+    """The material after one edit of the chosen vertices."""
+    albedo, specular = _part(edit, "albedo"), _part(edit, "specular")
+    if "preset" in edit:
+        material = with_preset(material, chosen, edit["preset"])
+    if albedo is not None:
+        painted = "painted" in albedo
+        material = with_painted(surface, material, chosen, cameras, **albedo) if painted else with_albedo(material, chosen, **albedo)
+    return material if specular is None else with_specular(material, chosen, **specular)
+
+
+def _part(edit: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+    """A part of an edit, None where it is left out. ValueError where it has not the keys that it should."""
+    if name not in edit:
+        return None
+    part, either, some = edit[name], EITHER.get(name, ()), SOME_OF.get(name, set())
+    if isinstance(part, Mapping) and part and (set(part) in either or set(part) <= some):
+        return part
+    ways = [" and ".join(sorted(keys)) for keys in either] + ([f"some of {', '.join(sorted(some))}"] if some else [])
+    raise ValueError(f"wanted {', or '.join(ways)} as {name}, given {_said(part)}")
+
+
+def region_of(surface: Surface, material: Material, region: Mapping[str, Any] | None, cameras: Mapping[str, Camera]) -> Bool:
     """(V,) which vertices a region has."""
     if region is None:
         return np.ones(len(surface.vertices), bool)
-    if set(region) not in REGION_KEYS:
-        raise ValueError(f"a region of {' and '.join(sorted(region)) or 'nothing'}")
     if "cluster" in region:
-        kind, of = int(region["cluster"]), int(region["of"])
-        if not 1 <= kind <= of:
-            raise ValueError(f"cluster {kind} of {of}")
-        return np.asarray(clusters(surface, material, of) == kind - 1)
-    camera, mask = _camera(cameras, region["view"]), read_mask(Path(region["mask"]))
-    if mask.shape != (camera.height, camera.width):
-        raise CaptureError(f"{region['mask']}: wanted {camera.width} x {camera.height} pixels, given {mask.shape[1]} x {mask.shape[0]}")
+        kind, of = region["cluster"], region["of"]
+        if type(kind) is not int or type(of) is not int or not 1 <= kind <= of <= MOST_KINDS:
+            wanted = f"whole numbers, of from 1 to {MOST_KINDS} and cluster from 1 to of"
+            raise ValueError(f"wanted {wanted}, given cluster {_said(kind)} of {_said(of)}")
+        of_kind = np.asarray(clusters(surface, material, of) == kind - 1)
+        if not of_kind.any():
+            raise ValueError(f"wanted a kind that is somewhere on the object, given cluster {kind} of {of}, which is nowhere")
+        return of_kind
+    camera = _camera(cameras, region["view"])
+    painting = read_painting(_picture(region["mask"], "mask"), camera.height, camera.width)
+    # As of the object's mask: a pixel belongs to it where a channel is above half of full scale.
+    mask = np.asarray(painting[..., :3].max(2) > 0.5)
+    if not mask.any():
+        raise ValueError(f"wanted a mask with some white, given {_said(region['mask'])}, which has none")
     seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera))
     column, row = np.floor(project(camera, surface.vertices[seen])[0]).astype(int).T
     chosen = np.zeros(len(surface.vertices), bool)
@@ -117,26 +147,36 @@ def region_of(surface: Surface, material: Material, region: Any, cameras: Mappin
 
 
 def _camera(cameras: Mapping[str, Camera], name: Any) -> Camera:
-    if name not in cameras:
+    if not isinstance(name, str) or name not in cameras:
         known = f"among {', '.join(cameras)}" if cameras else "of the photographs"
-        raise CaptureError(f"edit: wanted a view {known}, given {name!r}; give --capture for its views")
+        raise ValueError(f"wanted a view {known}, given {_said(name)} (--capture gives a capture's views)")
     return cameras[name]
+
+
+def _picture(name: Any, key: str) -> Path:
+    if not isinstance(name, str) or not Path(name).exists():
+        raise ValueError(f"wanted a PNG file as {key}, given {_said(name)}, which is not there")
+    return Path(name)
 
 
 def clusters(surface: Surface, material: Material, count: int) -> Int:
     """(V,) kind of material, 0 the least glossy of `count`: k-means of the lobes' shares in albedo and weights, then VOTES votes of every
-    vertex with its neighbours, which leave no specks."""
-    if not 1 <= count <= 16:
-        raise ValueError(f"1 to 16 clusters, not {count}")
+    vertex with its neighbours, which leave no specks. ValueError where there are fewer materials than that."""
+    if count == 1:
+        return np.zeros(len(surface.vertices), int)
     weight = material.specular_weight.mean(2) if material.specular_weight.ndim == 3 else material.specular_weight
     total = material.albedo.mean(1) + weight.sum(1)
     share = weight / np.maximum(total, 1e-12)[:, None]
-    if not share.shape[1]:
-        return np.zeros(len(share), int)
-    # Starting at quantiles of the gloss, the same answer comes out every time.
-    order = np.argsort(share.sum(1), kind="stable")
-    start = share[order[((np.arange(count) + 0.5) / count * len(order)).astype(int)]]
-    centres, kind = kmeans2(share, start, minit="matrix")
+    distinct = np.unique(share, axis=0) if share.shape[1] else share[:1]
+    if len(distinct) < count:
+        raise ValueError(f"wanted at most {len(distinct)} kinds of material, as many as there are, given of {count}")
+    # Starting at quantiles of the gloss, the same answer comes out every time; of distinct materials, so that no two start alike.
+    order = np.argsort(distinct.sum(1), kind="stable")
+    start = distinct[order[((np.arange(count) + 0.5) / count * len(order)).astype(int)]]
+    with warnings.catch_warnings():
+        # A kind that loses all its vertices on the way stays, and is empty.
+        warnings.simplefilter("ignore", UserWarning)
+        centres, kind = kmeans2(share, start, minit="matrix")
     rank = np.argsort(np.argsort(centres.sum(1)))
     of_vertices: Int = rank[kind]
     one_way = edges(surface)
@@ -156,10 +196,11 @@ def with_albedo(
     """The material with another albedo on the chosen vertices."""
     albedo = material.albedo.copy()
     if colour is not None:
-        albedo[chosen] = _colour(colour) * reflectance_scale(material)
-    albedo[chosen] *= _colour(factor)
-    if hue_deg:
-        albedo[chosen] = turned_hue(albedo[chosen], hue_deg)
+        albedo[chosen] = _colour(colour, "colour") * reflectance_scale(material)
+    albedo[chosen] *= _colour(factor, "factor")
+    turn = _number(hue_deg, "hue_deg", -LARGEST)
+    if turn:
+        albedo[chosen] = turned_hue(albedo[chosen], turn)
     return replace(material, albedo=albedo, residual=None)
 
 
@@ -167,7 +208,7 @@ def with_painted(surface: Surface, material: Material, chosen: Bool, cameras: Ma
     """The material with the colours of a picture, sRGB, of the view's size, on the chosen vertices that the view's camera sees; what the
     picture has clear stays."""
     camera = _camera(cameras, view)
-    picture = read_painting(Path(painted), camera.height, camera.width)
+    picture = read_painting(_picture(painted, "painted"), camera.height, camera.width)
     seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera) & chosen)
     at = project(camera, surface.vertices[seen])[0]
     opacity = picture[..., 3:]
@@ -186,9 +227,7 @@ def turned_hue(colours: Float, degrees: float) -> Float:
 
 def with_specular(material: Material, chosen: Bool, factor: float = 1.0, sharpness_factor: float = 1.0) -> Material:
     """The material with other highlights on the chosen vertices; lobes of another sharpness are added to those there are."""
-    if not (0 <= factor <= LARGEST and 1 / LARGEST <= sharpness_factor <= LARGEST):
-        limits = f"a factor of 0 to {LARGEST:g} and a sharpness_factor above 0, {1 / LARGEST:g} to {LARGEST:g}"
-        raise ValueError(f"{limits}, not {factor} and {sharpness_factor}")
+    factor, sharpness_factor = _number(factor, "factor"), _number(sharpness_factor, "sharpness_factor", 1 / LARGEST)
     weight = material.specular_weight.copy()
     weight[chosen] *= factor
     if sharpness_factor == 1:
@@ -202,8 +241,8 @@ def with_specular(material: Material, chosen: Bool, factor: float = 1.0, sharpne
 
 def with_preset(material: Material, chosen: Bool, name: str) -> Material:
     """The material with a preset's highlights on the chosen vertices."""
-    if name not in PRESETS:
-        raise ValueError(f"preset one of {', '.join(PRESETS)}, not {name!r}")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(f"wanted one of {', '.join(PRESETS)} as preset, given {_said(name)}")
     sharpness, at_normal, metal = PRESETS[name]
     white = reflectance_scale(material)
     weight = material.specular_weight
@@ -220,8 +259,20 @@ def with_preset(material: Material, chosen: Bool, name: str) -> Material:
     return replace(material, albedo=albedo, specular_weight=np.concatenate([weight, own], axis=1), sharpness=lobes, residual=None)
 
 
-def _colour(value: float | Sequence[float]) -> Float:
-    colour = np.broadcast_to(np.asarray(value, float), 3)
-    if not ((colour >= 0) & (colour <= LARGEST)).all():
-        raise ValueError(f"numbers of 0 and more, up to {LARGEST:g}, not {value}")
-    return colour
+def _colour(value: float | Sequence[float], name: str) -> Float:
+    channels = value if isinstance(value, list | tuple | np.ndarray) else [value] * 3
+    if len(channels) != 3:
+        raise ValueError(f"wanted a number or three, one per channel, as {name}, given {_said(value)}")
+    return np.array([_number(channel, name) for channel in channels])
+
+
+def _number(value: Any, name: str, least: float = 0.0) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not least <= value <= LARGEST:
+        raise ValueError(f"wanted numbers of {least:g} to {LARGEST:g} as {name}, given {_said(value)}")
+    return float(value)
+
+
+def _said(value: Any) -> str:
+    """A value as files have it, its beginning where it is long."""
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text if len(text) <= 80 else f"{text[:80]}..."

@@ -2,7 +2,7 @@
 
     mesh.ply                 vertices (world frame, units of the capture), refined normals, albedo as sRGB vertex colour
     model.glb                textured physically based model;  model.obj, .mtl and textures likewise   (where textures are given)
-    model_N.glb              the same with N faces;  model_N.obj, .mtl and textures likewise   (for each N that is given)
+    model_N.glb              the same with N faces;  model_N.obj, .mtl, textures and mesh_N.ply likewise   (for each N that is given)
     lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
@@ -35,6 +35,7 @@ from mvps.cores import at_a_time, on_cores
 from mvps.folders import CHECKPOINT, RESULT_MARKS, appearing_whole
 from mvps.gltf import glb_bytes, metallic_roughness
 from mvps.inputs import DAMAGED, JSON_LIMIT, check_npy, check_npz, parsed_json, read_file
+from mvps.mesh import nearest, normalise
 from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
 from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
@@ -66,6 +67,7 @@ def write_reconstruction(
             files |= _model_files("model", textures)
         for faces, of_level in levels.items():
             files |= _model_files(f"model_{faces}", of_level)
+            files[f"mesh_{faces}.ply"] = _level_ply(reconstruction, of_level.surface)
         if report:
             files["report.html"] = report.encode("utf-8")
         for name, content in files.items():
@@ -219,15 +221,25 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _mesh_files(reconstruction: Reconstruction) -> dict[str, bytes]:
-    surface, material = reconstruction.surface, reconstruction.material
-    scale = reflectance_scale(material)
-    colours = srgb_bytes(material.albedo / scale)
-    mesh = PlyMesh(surface.vertices, material.normal, colours, surface.faces)
+    material = reconstruction.material
     arrays = io.BytesIO()
     values = {name: getattr(material, name) for name in (*_MATERIAL, *_OF_ALL)} | _residual_arrays(material.residual)
     np.savez(arrays, allow_pickle=False, **values)
+    scale = reflectance_scale(material)
+    return {"mesh.ply": _ply(reconstruction.surface, material.normal, material.albedo, scale), "material.npz": arrays.getvalue()}
+
+
+def _level_ply(reconstruction: Reconstruction, shell: Surface) -> bytes:
+    """A mesh of fewer faces, each vertex with the normal and the albedo of the full one's nearest point."""
+    full, material = reconstruction.surface, reconstruction.material
+    found = nearest(full, shell.vertices)
+    normal, albedo = (np.einsum("nk,nkc->nc", found.barycentric, a[full.faces[found.face]]) for a in (material.normal, material.albedo))
+    return _ply(shell, normalise(normal), albedo, reflectance_scale(material))
+
+
+def _ply(surface: Surface, normal: Float, albedo: Float, scale: float) -> bytes:
     comment = f"colour = sRGB of albedo / {scale:.9g}; the normal is the refined shading normal"
-    return {"mesh.ply": ply_bytes(mesh, comment), "material.npz": arrays.getvalue()}
+    return ply_bytes(PlyMesh(surface.vertices, normal, srgb_bytes(albedo / scale), surface.faces), comment)
 
 
 def _model_files(name: str, textures: Textures) -> dict[str, bytes]:

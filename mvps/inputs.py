@@ -21,6 +21,9 @@ import numpy as np
 JSON_LIMIT = 1 << 26
 """Bytes of a JSON file: lights of a hundred thousand photographs take 20 MB."""
 
+MOST_DIGITS = 1000
+"""Of a whole number in JSON."""
+
 DAMAGED = (
     OSError,
     ValueError,
@@ -63,7 +66,7 @@ def read_file(path: Path, most: int, first: int = -1) -> bytes:
 
 
 def parsed_json(data: bytes | str) -> Any:
-    """The value of a JSON text. ValueError where it is none, nests too deeply or holds a number that is not finite."""
+    """The value of a JSON text. ValueError where it is none, nests too deeply or holds a number that is not finite or too long."""
 
     def finite(text: str) -> float:
         number = float(text)
@@ -71,8 +74,14 @@ def parsed_json(data: bytes | str) -> Any:
             raise ValueError(f"the number {text[:20]}, which is not finite")
         return number
 
+    def whole(text: str) -> int:
+        # Python would refuse a few thousand digits more with an advice to programmers.
+        if len(text) > MOST_DIGITS:
+            raise ValueError(f"the number {text[:20]}..., of {len(text)} digits")
+        return int(text)
+
     try:
-        return json.loads(data, parse_float=finite, parse_constant=finite)
+        return json.loads(data, parse_float=finite, parse_constant=finite, parse_int=whole)
     except RecursionError:
         raise ValueError("lists within lists too deep to read") from None
 

@@ -7,6 +7,7 @@ capture -> visual hull -> lights -> photometric stereo of every view -> Stage I:
 from __future__ import annotations
 
 import sys
+from argparse import ArgumentTypeError
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module
@@ -39,6 +40,9 @@ the time."""
 
 FEWER_LIGHTS = {"draft": 2, "standard": 1, "fine": 1}
 """How many times fewer lights of a view tell its pixels' albedo than tell their six unknowns (mvps/joint/thinned.py)."""
+
+LEAST_FACES = 4
+"""Of a closed mesh: a tetrahedron's."""
 
 
 @dataclass(frozen=True)
@@ -161,13 +165,18 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
         part, lights = thinned(used, lights_of(reconstruction, used), FEWER_LIGHTS[settings.preset])
         density = TEXELS_PER_PIXEL[settings.preset]
         surface = reconstruction.surface
-        shells = {faces: shell for faces in settings.faces if (shell := decimated(surface, faces)) is not None}
+        fewer = [faces for faces in settings.faces if faces < len(surface.faces)]
+        shells = {faces: shell for faces in fewer if (shell := decimated(surface, faces)) is not None}
         maps = [reconstruction.normal_maps[reconstruction.views.index(view.name)] for view in part.views]
         textures, *levels = bake(surface, reconstruction.material, lights, part, density, tuple(shells.values()), maps)
         off = fit_error(reconstruction.material.specular_weight, reconstruction.material.law)
-        stage.status(f"glTF's highlights are {100 * off:.0f} % off ours" if off else "no highlights")
-        if len(shells) < len(settings.faces):
-            stage.status("no models of fewer faces: the mesh has an edge of more than two")
+        said = [f"glTF's highlights are {100 * off:.0f} % off ours" if off else "no highlights"]
+        if len(fewer) < len(settings.faces):
+            more = ", ".join(str(faces) for faces in settings.faces if faces not in fewer)
+            said.append(f"no models of {more} faces: the mesh has {len(surface.faces)}")
+        if any(faces not in shells for faces in fewer):
+            said.append("no models of fewer faces: the mesh has an edge of more than two")
+        stage.status("; ".join(said))
     metrics = {**reconstruction.metrics, "stages": progress.stages}
     finished = replace(reconstruction, metrics=metrics)
     with progress.stage("report and files"):
@@ -206,7 +215,15 @@ def load_libraries() -> None:
         import_module(name)
 
 
-FACES_HELP = "write models of about so many faces too (model_N.glb, model_N.obj), their detail in the normal map"
+def face_counts(text: str) -> tuple[int, ...]:
+    """Numbers of faces, each once: "20000,5000" -> (20000, 5000)."""
+    counts = tuple(dict.fromkeys(number_list(text)))
+    if min(counts) < LEAST_FACES:
+        raise ArgumentTypeError(f"wanted {LEAST_FACES} faces or more, as many as a closed mesh has at least, given {min(counts)}")
+    return counts
+
+
+FACES_HELP = "write models of about so many faces too (model_N.glb, model_N.obj, mesh_N.ply), their detail in the normal map"
 
 
 def main(argv: Sequence[str]) -> None:
@@ -223,7 +240,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
     made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or end with what it takes")
     made.add_argument("--seed", type=whole, default=0, help="of all random draws")
-    made.add_argument("--faces", type=number_list, default=(), metavar="N,N", help=FACES_HELP)
+    made.add_argument("--faces", type=face_counts, default=(), metavar="N,N", help=FACES_HELP)
     made.add_argument("--resume", action="store_true", help="go on where an interrupted run with the same options stopped")
     given = parse(made, argv)
     settings = Settings(

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mvps.inputs import JSON_LIMIT, parsed_json, read_file
 from mvps.mesh import lengths, normalise
 from mvps.scene import Camera, CaptureError, Float, Surface
 
@@ -79,8 +79,10 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     digits, spaces and . _ + -. CaptureError where it is none."""
     form = 'a list "cameras" of objects with name, K, rotation, translation, width and height'
     try:
-        records = json.loads(path.read_bytes())["cameras"]
+        records = parsed_json(read_file(path, JSON_LIMIT))["cameras"]
         cameras = {_name(record): _camera(record) for record in records}
+    except OSError as error:
+        raise CaptureError(f"{path}: wanted {form}, given a file that cannot be read ({error.strerror}); check the path") from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise CaptureError(f"{path}: wanted {form}, given something else ({error}); see the help of --cameras") from error
     if not cameras or len(cameras) != len(records):

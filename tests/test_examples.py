@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import re
 import runpy
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +23,7 @@ from mvps.synthetic.scene import make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
 
 EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(EXAMPLES[0].parents[1])}
 Picture = Callable[..., np.ndarray]
 
 
@@ -48,12 +53,24 @@ def picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Picture:
     def made_by(number: int, *arguments: Path) -> np.ndarray:
         (path,) = [example for example in EXAMPLES if example.name.startswith(f"{number:02d}_")]
         monkeypatch.setattr(sys, "argv", [path.name, *map(str, arguments), str(tmp_path / "picture.png")])
-        runpy.run_path(str(path), run_name="__main__")
+        with pytest.raises(SystemExit, match=r"^0$"):
+            runpy.run_path(str(path), run_name="__main__")
         image = cv2.imread(str(tmp_path / "picture.png"))
         assert image is not None
         return image.astype(float)
 
     return made_by
+
+
+def complaint(number: int, *arguments: object) -> str:
+    """The one sentence with which an example ends."""
+    (path,) = [example for example in EXAMPLES if example.name.startswith(f"{number:02d}_")]
+    ended = subprocess.run(
+        [sys.executable, path, *map(str, arguments)], cwd=path.parents[1], env=ENVIRONMENT, capture_output=True, text=True
+    )
+    said = ended.stderr.strip().splitlines()
+    assert ended.returncode == 2 and len(said) == 1 and said[0].startswith("mvps: "), ended.stderr
+    return said[0]
 
 
 def parts_of(image: np.ndarray, count: int) -> list[np.ndarray]:
@@ -104,3 +121,23 @@ def test_an_own_solver_block_finds_its_unknowns(picture: Picture, capsys: pytest
     assert (picture(7) < 255).any()
     words = capsys.readouterr().out.split()
     assert float(words[4].rstrip(",")) < 0.01 and float(words[7].rstrip(",")) < 0.02
+
+
+def test_capture_without_truth_is_not_compared(made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "capture", tmp_path / "bare", ignore=shutil.ignore_patterns("*_gt.mat", "mesh_Gt.ply", "light_*.txt"))
+    assert "wanted a capture with true normals" in complaint(6, tmp_path / "bare", tmp_path / "compared", tmp_path / "picture.png")
+    assert not (tmp_path / "compared").exists()
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_without_arguments_says_what_it_wants(example: Path) -> None:
+    wanted = re.search(r"^python examples/\S+ (.*)$", example.read_text(encoding="utf-8"), re.MULTILINE)
+    assert wanted is not None and f"wanted {wanted[1]}, given 0 arguments" in complaint(int(example.name[:2]))
+
+
+def test_examples_given_no_result_and_no_place_for_the_picture(made: Path, tmp_path: Path) -> None:
+    picture, nowhere = tmp_path / "picture.png", tmp_path / "nowhere" / "picture.png"
+    for number, second in ((1, made / "capture"), (4, made / "sky.hdr")):
+        assert "wanted a result folder" in complaint(number, made / "capture", second, picture)
+    assert f"{nowhere}: No such file" in complaint(5, made / "result", nowhere)
+    assert not list(tmp_path.iterdir())

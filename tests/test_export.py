@@ -19,6 +19,7 @@ import mvps.export
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.folders import appearing_whole
 from mvps.mesh import decimated
+from mvps.meshfile import read_ply
 from mvps.pbr import reflectance_scale
 from mvps.scene import CaptureError, Material, Reconstruction
 from mvps.texture import Textures, bake
@@ -103,14 +104,23 @@ def test_the_contract_names_exactly_these_files(scene: SphereScene, folder: Path
 
 def test_a_smaller_model_stands_beside_the_full_one(folder: Path, levels: Path) -> None:
     full, files = contents(folder), contents(levels)
-    small = {name for name in files if name.startswith("model_100")}
+    small = {name for name in files if "_100" in name}
     ends = [".glb", ".mtl", ".obj", *(f"_{name}.png" for name in ("base_color", "normal", "roughness", "specular"))]
-    assert small == {f"model_100{end}" for end in ends} and set(files) - small == set(full) - {"report.html"}
+    assert small == {"mesh_100.ply", *(f"model_100{end}" for end in ends)} and set(files) - small == set(full) - {"report.html"}
     assert all(files[name] == full[name] for name in set(files) - small)
-    for name in ("model_100.glb", "model_100.obj"):
+    for name in ("model_100.glb", "model_100.obj", "mesh_100.ply"):
         assert len(trimesh.load(levels / name, force="mesh", process=False).faces) == 100
     named = {word for line in (levels / "model_100.mtl").read_text().splitlines() for word in line.split() if word.endswith(".png")}
     assert named == {name for name in small if name.endswith(".png")}
+
+
+def test_a_smaller_ply_has_the_full_one_s_normals_and_colours(scene: SphereScene, levels: Path) -> None:
+    full, small = (read_ply(levels / name) for name in ("mesh.ply", "mesh_100.ply"))
+    np.testing.assert_allclose(np.linalg.norm(small.normals, axis=1), 1)
+    # Decimation keeps vertices near those of the full mesh: of a sphere's, the closest is nearly the nearest point.
+    closest = np.linalg.norm(small.vertices[:, None] - full.vertices[None], axis=2).argmin(1)
+    assert np.degrees(np.arccos((small.normals * full.normals[closest]).sum(1).clip(-1, 1))).max() < 15
+    assert np.abs(small.colours.astype(int) - full.colours[closest]).mean() < 5
 
 
 def test_same_reconstruction_same_bytes(scene: SphereScene, folder: Path, tmp_path: Path) -> None:

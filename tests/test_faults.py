@@ -230,6 +230,24 @@ def test_places_that_cannot_be_written_are_refused_before_the_work(tmp_path: Pat
             check_place(place)
 
 
+def test_the_root_is_no_place() -> None:
+    with pytest.raises(CaptureError, match=r"^/: wanted a new or empty folder"):
+        check_place(Path("/"))
+
+
+def test_places_in_captures_and_results_are_refused(tmp_path: Path) -> None:
+    for name, files in (("cap", ["Calib_Results.mat"]), ("views", ["view_01/001.png"]), ("res", ["mesh.ply", "settings.json"])):
+        for file in files:
+            (tmp_path / name / file).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name / file).write_text("")
+    (tmp_path / "cap" / "view_07").mkdir()
+    for inside, kind in (("cap/view_07", "a capture"), ("cap/deep/out", "a capture"), ("views/out", "a capture"), ("res/out", "a result")):
+        with pytest.raises(CaptureError, match=f"{inside}: wanted a place outside captures and results, given one in .*, {kind};"):
+            check_place(tmp_path / inside)
+    for beside in ("out", "cap2", "view_01", "new/out"):
+        check_place(tmp_path / beside)
+
+
 def test_capture_and_result_whose_names_are_no_text(capture: Path, tmp_path: Path) -> None:
     odd = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
     os.mkdir(odd)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from sphere_scene import SphereScene, make_sphere
 
+from mvps.command import run
 from mvps.export import write_reconstruction
 from mvps.texture import bake
 
@@ -66,3 +70,19 @@ def test_the_files_tangents_are_those_of_its_texture_coordinates(
     write_reconstruction(r, tmp_path / "result", bake(r.surface, r.material, r.lights, scene.capture, 2)[0])
     found = tangent_gap_deg(read_glb(tmp_path / "result" / "model.glb"))
     assert found.mean() < 1.5 and np.percentile(found, 99) < 5
+
+
+@pytest.mark.independent
+@pytest.mark.parametrize("name", ["mitsuba_check", "levels", "blender_check"])
+def test_what_is_no_result_is_refused_with_a_sentence(
+    scene: SphereScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    # It is asked for nothing before the result is read.
+    monkeypatch.setitem(sys.modules, "bpy", ModuleType("bpy"))
+    main = import_module(name).main
+    assert run(main, [str(tmp_path / "nowhere"), str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith(f"mvps: {tmp_path}/nowhere: wanted a result folder, given one without mesh.ply")
+    write_reconstruction(scene.reconstruction, tmp_path / "bare")
+    assert run(main, [str(tmp_path / "bare"), str(tmp_path)]) == 2
+    assert "model.glb" in capsys.readouterr().err

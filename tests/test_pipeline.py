@@ -65,9 +65,11 @@ def test_figures_of_the_embedded_capture(capture: Path, result: Path) -> None:
 
 
 def test_a_draft_goes_without_the_occupancy_field(capture: Path, tmp_path: Path) -> None:
-    out = reconstructed(capture, tmp_path / "draft", "--faces", "400,100", preset="draft")
+    out = reconstructed(capture, tmp_path / "draft", "--faces", f"400,100,400,{10**20}", preset="draft")
     assert {path.name for path in out.glob("model*.glb")} == {"model.glb", "model_400.glb", "model_100.glb"}
-    assert "occupancy field" not in {stage["name"] for stage in read_reconstruction(out).metrics["stages"]}
+    assert {path.name for path in out.glob("mesh*.ply")} == {"mesh.ply", "mesh_400.ply", "mesh_100.ply"}
+    stages = {stage["name"]: stage for stage in read_reconstruction(out).metrics["stages"]}
+    assert "occupancy field" not in stages and f"; no models of {10**20} faces: the mesh has " in stages["textures"]["status"]
     found = figures(out, capture)
     assert found["light_error_deg"] < 1.0 and found["map_normal_error_deg"] < 4.0 and found["chamfer_px"] < 0.5
 
@@ -205,6 +207,8 @@ def test_bad_input_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path, 
     assert all(line.startswith("mvps: ") for line in said.strip().splitlines() if "wanted" in line) and said.count("wanted") == 4
     assert run(reconstruct.main, [str(capture), "--out", str(out), "--hold-out-lights", "3,99", "--quiet"]) == 2
     assert "--hold-out-lights: wanted some of 1, 2, " in capsys.readouterr().err
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--faces", "500,3", "--quiet"]) == 2
+    assert "--faces: wanted 4 faces or more" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

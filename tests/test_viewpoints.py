@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,13 @@ def test_other_files_are_refused(tmp_path: Path, text: str) -> None:
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(CaptureError, match=r"cameras.json: wanted a list"):
         read_cameras(path)
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(CaptureError, match=f"{path}: wanted a list .* given a file that cannot be read"):
+            read_cameras(path)
 
 
 @pytest.mark.parametrize(
