@@ -228,27 +228,20 @@ def asks_for_own(given: Namespace) -> bool:
 
 
 def check_used(given: Namespace) -> None:
-    """CaptureError about an option that changes nothing beside the others."""
-    placed, layers = [name for name in ("camera", "turntable", "cameras") if name in given], set(given.layers)
+    """CaptureError about an option of a camera or a light that is not there."""
+    placed = any(name in given for name in ("camera", "turntable", "cameras"))
     around = "turntable" in given or not (placed or "capture" in given)
-    own, lit = around or "camera" in given, bool(layers & {"image", "specular", "shadow"})
-    exposed = bool(layers & {"image", "specular"}) and (given.format != "exr" or given.video)
+    own = around or "camera" in given
     uses = {
         "target": ("camera" in given, "--camera"),
-        "capture": (not placed or "edit" in given, "--edit, or without another option for cameras"),
         "views": ("capture" in given and not placed, "--capture, for its cameras"),
         "elevation": (around, "--turntable"),
         "size": (own, "--camera or --turntable"),
         "fov": (own, "--camera or --turntable"),
         "up": (own or "envmap" in given, "--camera, --turntable or --envmap"),
-        "light": (lit, "a layer image, specular or shadow"),
-        "point": (lit, "a layer image, specular or shadow"),
-        "envmap": (lit, "a layer image, specular or shadow"),
         "envmap_turn": ("envmap" in given, "--envmap"),
         "envmap_lights": ("envmap" in given, "--envmap"),
         "frame": (bool(given.light or given.point), "--light or --point"),
-        "no_bounce": ("image" in layers, "the layer image"),
-        "exposure": (exposed, "a layer image or specular in PNG or a video"),
     }
     made = options()
     for name, (used, wanted) in uses.items():
