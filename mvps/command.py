@@ -26,7 +26,7 @@ from mvps.addresses import loading
 
 # These load numpy.
 with loading():
-    from mvps.inputs import parsed_json
+    from mvps.inputs import JSON_LIMIT, parsed_json, read_file
     from mvps.memory import keep_freed
     from mvps.progress import ConsoleHandler
     from mvps.scene import CaptureError
@@ -213,7 +213,7 @@ def lights_argument(text: str) -> tuple[int, ...] | Mapping[str, tuple[int, ...]
     if not text.strip() or set(text) <= set("0123456789, -+"):
         return number_list(text)
     try:
-        lights = parsed_json(Path(text).read_bytes())
+        lights = parsed_json(read_file(Path(text), JSON_LIMIT))
     except OSError as error:
         raise argparse.ArgumentTypeError(f"{text}: wanted a JSON file, or numbers such as 1,5,9, given {error.strerror}") from None
     except ValueError as error:

@@ -111,7 +111,7 @@ def _changed(surface: Surface, material: Material, chosen: Bool, edit: Mapping[s
 
 def _part(edit: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
     """A part of an edit, None where it is left out. ValueError where it has not the keys that it should."""
-    if name not in edit:
+    if name not in edit or (name == "region" and edit[name] is None):
         return None
     part, either, some = edit[name], EITHER.get(name, ()), SOME_OF.get(name, set())
     if isinstance(part, Mapping) and part and (set(part) in either or set(part) <= some):

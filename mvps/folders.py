@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -68,16 +69,15 @@ def write_whole(path: Path, content: str | bytes) -> None:
 def check_place(place: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> None:
     """CaptureError unless the place can be written and is free, an empty folder, or one that may be replaced: with all the files named in
     `marks`, by which an earlier output of the same kind is known, or with nothing but what is called `unfinished`, the rest of an
-    interrupted one; and CaptureError where it lies in a capture, which could not be read any more, or in a result, with which it would be
-    replaced."""
+    interrupted one; and CaptureError where it would be a view of a capture, which could not be read any more."""
     # The root has none above it.
     above = next((folder for folder in place.parents if folder.exists()), place)
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         given = "one that cannot be written" if above.is_dir() else f"{above.name}, a file"
         raise CaptureError(f"{place}: wanted a place in a folder that can be written, given {given}; give another --out")
-    for folder in place.parents:
-        if kind := _kind(folder):
-            raise CaptureError(f"{place}: wanted a place outside captures and results, given one in {folder}, {kind}; give another --out")
+    for folder in (place, *place.parents):
+        if re.fullmatch("view_[0-9]+", folder.name) and (folder.parent / "Calib_Results.mat").exists():
+            raise CaptureError(f"{place}: wanted a place that is no view of a capture, given one of {folder.parent}; give another --out")
     if not place.exists():
         return
     if not place.is_dir():
@@ -86,10 +86,3 @@ def check_place(place: Path, marks: tuple[str, ...] = (), unfinished: str = "") 
     if not earlier and any(path.name != unfinished for path in place.iterdir()):
         wanted = "a new or empty folder or an earlier result" if marks else "a new or empty folder"
         raise CaptureError(f"{place}: wanted {wanted}, given a folder with other files; give another --out or empty this one")
-
-
-def _kind(folder: Path) -> str:
-    """Whether a folder is a capture or a result; empty where it is neither."""
-    if (folder / "Calib_Results.mat").exists() or any(view.is_dir() for view in folder.glob("view_[0-9][0-9]")):
-        return "a capture"
-    return "a result" if all((folder / name).is_file() for name in RESULT_MARKS) else ""

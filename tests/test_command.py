@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -166,3 +167,9 @@ def test_lights_argument_of_numbers_only_is_no_path() -> None:
     for text in ("0", "-3", "1,,2", " "):
         with pytest.raises(argparse.ArgumentTypeError, match="separated by commas"):
             lights_argument(text)
+
+
+def test_a_pipe_of_lights_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(argparse.ArgumentTypeError, match="Is a pipe"):
+        lights_argument(str(tmp_path / "pipe"))
