@@ -327,7 +327,8 @@ def test_chart_draws_the_values() -> None:
 
 
 def test_rounds_keep_their_numbers_in_the_chart() -> None:
-    html = _rounds([{"round": 1.0}, {"round": 2.0, "residual": 0.5}, {"round": 3.0, "residual": 0.25}])
+    """Through all stages, of which every one counts from one."""
+    html = _rounds([{"round": 1.0}, {"round": 2.0, "residual": 0.5}, {"round": 1.0, "residual": 0.25}])
     ticks = dict(re.findall(r'<text x="([\d.]+)"[^>]*text-anchor="middle">(\d)</text>', html))
     dots = re.findall(r'<circle cx="([\d.]+)"[^>]*><title>(.*?)</title>', html)
     assert list(ticks.values()) == ["1", "2", "3"]

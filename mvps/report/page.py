@@ -262,10 +262,12 @@ ROUND_COLUMNS = {
 def _rounds(rounds: Sequence[Mapping[str, Any]]) -> str:
     if not rounds:
         return ""
-    residuals = [r["residual"] if is_number(r.get("residual")) else None for r in rounds]
-    names = [_shown(r.get("round")) for r in rounds]
+    # Every stage counts its own from one.
+    counted = [{**one, "round": k} for k, one in enumerate(rounds, 1)]
+    residuals = [one["residual"] if is_number(one.get("residual")) else None for one in rounds]
+    names = [str(one["round"]) for one in counted]
     chart = line_chart(residuals, names, "round", "residual") if any(value is not None for value in residuals) else ""
-    return _section("Rounds", chart + _columns(rounds, ROUND_COLUMNS))
+    return _section("Rounds", chart + _columns(counted, ROUND_COLUMNS))
 
 
 def _components(components: Sequence[Mapping[str, Any]]) -> str:
