@@ -138,6 +138,7 @@ def main(argv: Sequence[str]) -> None:
         lines.append([result.name, str(len(found)), f"{np.mean(found):.1f}", f"{min(found):.1f}"])
         if given.pictures:
             code = np.where(np.concatenate(shown) > 0, np.concatenate(shown), 0) ** (1 / 2.2)
+            given.pictures.mkdir(parents=True, exist_ok=True)
             cv2.imwrite(str(given.pictures / f"{result.name}.png"), np.rint(255 * code[..., ::-1]).astype(np.uint8))
     command = "python benchmarks/blender_check.py RESULT CAPTURE ..."
     note = (
