@@ -7,7 +7,8 @@ With e_v the mean absolute error of vertex v's held-out samples over their mean 
 
 and a component stays where gain > CERTAIN * noise: vertices are compared with themselves, which takes their differences out of the noise,
 and by ratios, because errors have long tails. Where there are errors of several kinds (of samples in the light, of samples in shadow), one
-must gain by that, and none lose by as much.
+must gain by that, and none lose by as much. That surfaces which see each other light each other needs no proof, only its strength does: for
+inter-reflection gain > noise is enough. Left out by chance it makes hollows shallower; kept by chance it comes out weak.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ SHARPENING_STEP, SHARPENING_TOLERANCE, MOST_SHARPENED = 0.35, 0.1, 16
 CERTAIN = 3.0
 """Standard errors that a gain must exceed: fewer than one in a hundred runs of half a dozen trials then keeps a component by chance."""
 
+
+LIKELY = 1.0
+"""The same for inter-reflection."""
 
 POOR_FIT = 0.1
 """Residual, as a share of the images' signal, above which a model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy
@@ -78,12 +82,12 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     errors = held_out(model)
     trials = []
 
-    def try_out(name: str, add: Callable[[Model], Model]) -> None:
+    def try_out(name: str, add: Callable[[Model], Model], least: float = CERTAIN) -> None:
         nonlocal model, errors
         start = time.perf_counter()
         trial = add(model)
         with_it = held_out(trial)
-        judgement = judged(name, errors, with_it)
+        judgement = judged(name, errors, with_it, least=least)
         trials.append(replace(judgement, seconds=time.perf_counter() - start))
         if judgement.kept:
             model, errors = trial, with_it
@@ -95,7 +99,7 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     if largest.grazing:
         try_out("diffuse term that changes at grazing angles", lambda chosen: replace(chosen, grazing=True))
     if largest.bounce:
-        try_out("inter-reflection", lambda chosen: replace(chosen, bounce=True))
+        try_out("inter-reflection", lambda chosen: replace(chosen, bounce=True), LIKELY)
     return model, trials
 
 
@@ -106,14 +110,14 @@ def gained(before: Float, after: Float) -> tuple[float, float]:
     return (float(ratio.mean()), float(ratio.std() / np.sqrt(len(ratio)))) if len(ratio) else (0.0, 0.0)
 
 
-def judged(name: str, before: Float, after: Float) -> Trial:
+def judged(name: str, before: Float, after: Float, *, least: float = CERTAIN) -> Trial:
     """The verdict on a component from the errors (n,) without and with it, or from those of several kinds of samples (kinds, n): one must
-    gain, none lose. The account is that of the surest; its time is left at 0."""
+    gain by more than `least` standard errors, none lose by more than CERTAIN. The account is that of the surest; its time is left at 0."""
     of_kinds = [gained(b, a) for b, a in zip(np.atleast_2d(before), np.atleast_2d(after), strict=True)]
-    kept = any(gain > CERTAIN * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
+    kept = any(gain > least * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
     # A kind that no vertex has, or that does not change, has no account.
     told = [of_kind for of_kind in of_kinds if any(of_kind)] or of_kinds
-    gain, noise = max(told, key=lambda of_kind: of_kind[0] - CERTAIN * of_kind[1])
+    gain, noise = max(told, key=lambda of_kind: of_kind[0] - least * of_kind[1])
     return Trial(name, kept, gain, noise, 0.0)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +30,7 @@ def errors(level: float) -> np.ndarray:
 
 def test_a_component_that_helps_stays_and_one_that_does_not_goes() -> None:
     def held_out(model: Model) -> np.ndarray:
-        return errors(1.0 - 0.2 * (30.0 in model.sharpness) + 0.001 * model.bounce)
+        return errors(1.0 - 0.2 * (30.0 in model.sharpness) + 0.02 * model.bounce)
 
     model, trials = choose(Model((8.0, 30.0), True, True), held_out)
     assert model == Model((30.0,))
@@ -45,6 +46,18 @@ def test_one_kind_of_samples_must_gain_and_none_lose() -> None:
     # Few samples of great scatter do not hide what the others tell.
     unsure = np.where(np.arange(400) < 30, np.exp(rng.normal(0, 2.0, 400)), np.nan)
     assert judged("", before, np.stack([0.9 * scatter[0], unsure])).kept
+
+
+def test_inter_reflection_needs_no_proof() -> None:
+    """A gain of two standard errors keeps it, and no other component; one of half a standard error does not."""
+    scatter = np.random.default_rng(0).normal(size=400)
+    scatter = (scatter - scatter.mean()) / scatter.std()
+
+    def held_out(sure: float) -> Callable[[Model], np.ndarray]:
+        return lambda model: np.exp((0.1 * scatter - sure * 0.1 / 20) * ((8.0 in model.sharpness) + model.grazing + model.bounce))
+
+    assert choose(Model((8.0,), True, True), held_out(2.0), sharpen=False)[0] == Model((), False, True)
+    assert choose(Model((8.0,), True, True), held_out(0.5), sharpen=False)[0] == Model()
 
 
 def test_vertices_without_held_out_samples_do_not_count() -> None:
