@@ -8,7 +8,7 @@ With e_v the mean absolute error of vertex v's held-out samples over their mean 
 and a component stays where gain > CERTAIN * noise: vertices are compared with themselves, which takes their differences out of the noise,
 and by ratios, because errors have long tails. Where there are errors of several kinds (of samples in the light, of samples in shadow), one
 must gain by that, and none lose by as much. That surfaces which see each other light each other needs no proof, only its strength does: for
-inter-reflection gain > noise is enough. Left out by chance it makes hollows shallower; kept by chance it comes out weak.
+inter-reflection gain > noise is enough. Left out by chance it makes hollows shallower (docs/method.md).
 """
 
 from __future__ import annotations
