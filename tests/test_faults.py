@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -120,16 +120,6 @@ def test_too_few_addresses_are_refused_before_numpy_is_there() -> None:
         )
         assert result.returncode == 2 and result.stderr.count("\n") == 1
         assert result.stderr.startswith("mvps: memory: wanted at least")
-
-
-@pytest.fixture
-def interruptible() -> Iterator[None]:
-    """Signals as at a terminal: what a shell starts in the background ignores Ctrl-C, under nohup a hang-up, and what tests start would."""
-    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
-    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 @pytest.mark.usefixtures("interruptible")

@@ -235,6 +235,7 @@ def test_a_page_that_is_closed_is_no_error(address: str, capfd: pytest.CaptureFi
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_ends_it(scene: SphereScene, tmp_path: Path) -> None:
     write_reconstruction(scene.reconstruction, tmp_path / "result")
     command = [sys.executable, "-m", "mvps.view", str(tmp_path / "result"), "--port", "0", "--no-browser"]
@@ -242,7 +243,10 @@ def test_ctrl_c_ends_it(scene: SphereScene, tmp_path: Path) -> None:
         assert running.stdout is not None
         assert "http://127.0.0.1:" in running.stdout.readline()
         running.send_signal(signal.SIGINT)
-        _, said = running.communicate(timeout=60)
+        try:
+            _, said = running.communicate(timeout=60)
+        finally:
+            running.kill()
     assert (running.returncode, said) == (0, "")
 
 
