@@ -103,6 +103,15 @@ def edges(surface: Surface) -> Int:
     return np.stack([number // n, number % n], 1)
 
 
+def neighbour_sums(values: Float, ends: Int) -> Float:
+    """(V, k) sums of the values (V, k) at the other ends (E, 2) of a vertex's edges."""
+    sums = np.zeros(values.shape)
+    for here, there in (ends.T, ends.T[::-1]):
+        for k, column in enumerate(values.T):
+            sums[:, k] += np.bincount(here, column[there], len(values))
+    return sums
+
+
 def edge_numbers(faces: Int, n: int) -> Int:
     """(F, 3) for the edges 0-1, 1-2, 2-0 of faces over n vertices, i n + j with i < j: numpy sorts numbers many times faster than rows."""
     other = faces[:, [1, 2, 0]]
@@ -185,6 +194,10 @@ def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) 
             feature_dihedral_threshold=KNIFE_EDGE,
         )
     return largest_component(Surface(vertices, faces))
+
+
+LEAST_FACES = 4
+"""Of a closed mesh: a tetrahedron's."""
 
 
 def decimated(surface: Surface, faces: int) -> Surface | None:

@@ -41,9 +41,6 @@ the time."""
 FEWER_LIGHTS = {"draft": 2, "standard": 1, "fine": 1}
 """How many times fewer lights of a view tell its pixels' albedo than tell their six unknowns (mvps/joint/thinned.py)."""
 
-LEAST_FACES = 4
-"""Of a closed mesh: a tetrahedron's."""
-
 
 @dataclass(frozen=True)
 class Settings:
@@ -217,6 +214,8 @@ def load_libraries() -> None:
 
 def face_counts(text: str) -> tuple[int, ...]:
     """Numbers of faces, each once: "20000,5000" -> (20000, 5000)."""
+    from mvps.mesh import LEAST_FACES
+
     counts = tuple(dict.fromkeys(number_list(text)))
     if min(counts) < LEAST_FACES:
         raise ArgumentTypeError(f"wanted {LEAST_FACES} faces or more, as many as a closed mesh has at least, given {min(counts)}")

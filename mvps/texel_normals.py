@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mvps.mesh import edges, lengths, normalise
+from mvps.mesh import edges, lengths, neighbour_sums, normalise
 from mvps.scene import Bool, Float, Int, Surface
 
 LEAST_VIEWS = 1.5
@@ -57,11 +57,8 @@ def _around(surface: Surface, places: Places, values: Float, known: Bool) -> Flo
     corners, count = surface.faces[places.face], len(surface.vertices)
     weight = places.barycentric * known[:, None]
     sums = [np.bincount(corners.ravel(), (weight * of[:, None]).ravel(), count) for of in (*values.T, np.ones(len(values)))]
-    own = np.stack(sums, 1)
-    near = own.copy()
-    for here, there in (edges(surface).T, edges(surface).T[::-1]):
-        for k in range(own.shape[1]):
-            near[:, k] += np.bincount(here, own[there, k], count)
+    own: Float = np.stack(sums, 1)
+    near = own + neighbour_sums(own, edges(surface))
     mean = near[:, :-1] / np.maximum(near[:, -1:], 1e-300)
     found: Float = np.einsum("nk,nkc->nc", places.barycentric, mean[corners])
     return found

@@ -19,7 +19,7 @@ import torch
 from mvps.joint.bas_relief import bas_relief, relief_variance, turned
 from mvps.joint.photometry import State, Task, photometric_round
 from mvps.joint.refine import Refined, RefineSettings, finished
-from mvps.mesh import edges, lengths
+from mvps.mesh import edges, lengths, neighbour_sums
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, less_confident
 
 ROUNDS = {"draft": 1, "standard": 3, "fine": 5}
@@ -89,10 +89,7 @@ def with_rim(confidence: Float, surface: Surface) -> Float:
     vertex, the normal is what integration makes of its neighbours', and its variance their mean."""
     known, ends = confidence > 0, edges(surface)
     variance = np.where(known, 1 / np.where(known, confidence, 1) - 1, 0)
-    total, count = np.zeros((2, len(confidence)))
-    for here, there in (ends.T, ends.T[::-1]):
-        total += np.bincount(here, variance[there], len(total))
-        count += np.bincount(here, known[there], len(count))
+    total, count = neighbour_sums(np.stack([variance, known], 1), ends).T
     beside = ~known & (count > 0)
     return np.where(beside, 1 / (1 + total / np.maximum(count, 1)), confidence)
 

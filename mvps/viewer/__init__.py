@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvps.mesh import decimated, nearest, normalise
+from mvps.mesh import LEAST_FACES, decimated, nearest, normalise
 from mvps.scene import Float, Material, Surface
 from mvps.visibility import Hits, interpolate
 
@@ -39,9 +39,6 @@ MOST_LOBES = 4
 
 AROUND_BYTES = 10_000
 """At most, of the part: what is neither the program nor the model's arrays."""
-
-LEAST_FACES = 4
-"""Of a body that is closed: with fewer there is nothing to show."""
 
 
 @cache
