@@ -39,6 +39,9 @@ CERTAIN = 3.0
 LIKELY = 1.0
 """The same for inter-reflection."""
 
+INTER_REFLECTION = "inter-reflection"
+"""Name of its trial."""
+
 POOR_FIT = 0.1
 """Residual, as a share of the images' signal, above which a model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy
 objects."""
@@ -82,12 +85,12 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     errors = held_out(model)
     trials = []
 
-    def try_out(name: str, add: Callable[[Model], Model], least: float = CERTAIN) -> None:
+    def try_out(name: str, add: Callable[[Model], Model]) -> None:
         nonlocal model, errors
         start = time.perf_counter()
         trial = add(model)
         with_it = held_out(trial)
-        judgement = judged(name, errors, with_it, least=least)
+        judgement = judged(name, errors, with_it)
         trials.append(replace(judgement, seconds=time.perf_counter() - start))
         if judgement.kept:
             model, errors = trial, with_it
@@ -99,7 +102,7 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     if largest.grazing:
         try_out("diffuse term that changes at grazing angles", lambda chosen: replace(chosen, grazing=True))
     if largest.bounce:
-        try_out("inter-reflection", lambda chosen: replace(chosen, bounce=True), LIKELY)
+        try_out(INTER_REFLECTION, lambda chosen: replace(chosen, bounce=True))
     return model, trials
 
 
@@ -110,9 +113,15 @@ def gained(before: Float, after: Float) -> tuple[float, float]:
     return (float(ratio.mean()), float(ratio.std() / np.sqrt(len(ratio)))) if len(ratio) else (0.0, 0.0)
 
 
-def judged(name: str, before: Float, after: Float, *, least: float = CERTAIN) -> Trial:
+def least_gain(name: str) -> float:
+    """Standard errors that the gain of the component of this name must exceed."""
+    return LIKELY if name == INTER_REFLECTION else CERTAIN
+
+
+def judged(name: str, before: Float, after: Float) -> Trial:
     """The verdict on a component from the errors (n,) without and with it, or from those of several kinds of samples (kinds, n): one must
-    gain by more than `least` standard errors, none lose by more than CERTAIN. The account is that of the surest; its time is left at 0."""
+    gain, none lose by more than CERTAIN. The account is that of the surest; its time is left at 0."""
+    least = least_gain(name)
     of_kinds = [gained(b, a) for b, a in zip(np.atleast_2d(before), np.atleast_2d(after), strict=True)]
     kept = any(gain > least * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
     # A kind that no vertex has, or that does not change, has no account.
