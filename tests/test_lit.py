@@ -74,10 +74,36 @@ def test_one_dark_side_does_not_make_a_mask_too_large() -> None:
     assert not seen(shadowed).off
 
 
-def test_a_bright_background_judges_nothing() -> None:
-    view = photographed(disc(25))
-    bright = View("ball", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), (30000 - view.frame).astype(np.float32))
-    assert not seen(bright).judged and not seen(bright).off
+def before_wall(mask: Bool, wall: np.ndarray, radius: float = 25.0) -> View:
+    """The ball in front of a wall (height, width) as bright as its middle or so."""
+    view = photographed(mask, radius)
+    assert view.frame is not None
+    coverage = np.clip(radius - np.hypot(ROWS - 40, COLUMNS - 40) + 0.5, 0, 1)
+    frame = (view.frame + (1 - coverage) * wall).astype(np.float32)
+    return View("ball", CAMERA, mask, view.samples, view.scale, view.saturation, (), frame)
+
+
+@pytest.mark.parametrize("wall", [5000.0, 12000.0, 30000.0])
+@pytest.mark.parametrize("pixels", [-3, 0, 1, 3, 6])
+def test_before_a_wall_masks_are_found_too_large_and_never_too_small(pixels: int, wall: float) -> None:
+    view = before_wall(disc(25 + pixels), np.broadcast_to(wall * (1 + 0.1 * COLUMNS / SIZE), (SIZE, SIZE)))
+    found = seen(view)
+    assert found.judged and not found.dark and found.off == (pixels > 0)
+    if pixels > 0:
+        assert abs(found.edge + pixels) < 0.75
+        left = (moved(view, steps(view.mask), found) ^ disc(25)).sum()
+        assert left < 0.15 * (view.mask ^ disc(25)).sum() + 12
+
+
+@pytest.mark.parametrize("wall", [1000.0, 5000.0, 9000.0])
+def test_a_wall_as_bright_as_parts_of_the_object_is_not_taken_for_darkness(wall: float) -> None:
+    """Where the rim is darker than the wall behind it the mask was taken for too large by up to six pixels."""
+    assert not seen(before_wall(disc(25), np.full((SIZE, SIZE), wall))).off
+
+
+def test_a_patterned_wall_judges_nothing() -> None:
+    found = seen(before_wall(disc(28), np.where((ROWS // 4 + COLUMNS // 4) % 2 < 1, 3000.0, 12000.0)))
+    assert not found.judged and not found.off
 
 
 def test_holes_are_missing_where_lit_and_honest_where_dark() -> None:

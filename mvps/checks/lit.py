@@ -1,4 +1,5 @@
-"""Where the photographs of a view show the object: light, against a background that stays dark under all lights.
+"""Where the photographs of a view show the object: light, against a background that stays dark under all lights, or another brightness
+than the wall's behind it.
 
 With b the mean of a view's photographs over lights and channels (View.frame) and b0 = 1/4096 of full scale (a 12-bit sensor's step: noise
 around black ends near it), log(b + b0) has two heaps where the background is dark: noise and object. They are told apart by Otsu's
@@ -8,6 +9,10 @@ half of its mask is lit and what is far from the mask is dark, but for FEW pixel
 A pixel belongs to a mask where its centre sees the object. Pixels that the object covers by less than half, and those that a lens blurs
 its light into, are lit too but much darker than their neighbours nearer to the object: the edge of the object outside a mask is where
 brightness falls by more than half from a pixel to the next, inside a mask it is where light begins.
+
+Where the background is not dark, w is a polynomial of second degree along both axes of the picture, fitted to what is far from the mask
+by Cauchy's reweighted squares, and |b - w| takes the place of b: up to NOISE times its scatter it is the wall, above the object. A wall has
+shadows of the object, which differ too: against it masks are found too large, never too small.
 """
 
 from __future__ import annotations
@@ -16,10 +21,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_opening, binary_propagation, label, minimum_filter
 
 from mvps.scene import Bool, View
+from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA
 
 DARKEST = 1 / 4096
 """b0, of full scale."""
@@ -47,6 +54,16 @@ pixel, grown (-0.2 to -0.8: half of their new pixels are covered in part, and li
 PARTIAL = 1 / 3
 """Of its darkest neighbour within the object: a pixel half covered, by 2/3 for what reflection at the rim falls off over a pixel."""
 
+NOISE = 4.0
+"""Standard deviations (from the median of absolute deviations) that a wall's own pixels keep within, but for one in ten thousand."""
+
+FITS = 5
+"""Of the wall: from then on weights hardly change."""
+
+APART = 2.0
+"""How many times darker than the threshold a dark background is: the emptiest factor of two reaches down by the root of that, and a heap
+that reaches into it is not apart. (A ball's rim, a fifth as bright as its middle, was taken for a wall of a third.)"""
+
 BLOCK = np.ones((3, 3), bool)
 """Of pixels: no mixed pixels along an edge hold one, so a part that holds one is none of an edge's staircase."""
 
@@ -54,12 +71,14 @@ BLOCK = np.ones((3, 3), bool)
 @dataclass(frozen=True, eq=False)
 class Lit:
     """lit (height, width) where photographs show light; object: without pixels that the object covers by less than half; edges: pixels
-    from the mask's boundary out to the object's edge, (sectors,); judged: whether they tell object from background."""
+    from the mask's boundary out to the object's edge, (sectors,); judged: whether they tell object from background; dark: whether that is
+    a dark one."""
 
     lit: Bool
     object: Bool
     edges: NDArray[np.float64]
     judged: bool
+    dark: bool
 
     @property
     def edge(self) -> float:
@@ -70,7 +89,7 @@ class Lit:
     def off(self) -> bool:
         """Whether the mask as a whole is too large or too small: three quarters of the sectors say so, which no shadow makes."""
         least, most = np.quantile(self.edges, (0.25, 0.75))
-        return bool(self.judged and (least > TRUE_EDGES[1] or most < TRUE_EDGES[0]))
+        return bool(self.judged and ((self.dark and least > TRUE_EDGES[1]) or most < TRUE_EDGES[0]))
 
 
 def steps(mask: Bool) -> NDArray[np.float32]:
@@ -112,14 +131,39 @@ def lit_part(view: View, distance: NDArray[np.float32]) -> Lit | None:
     """What the photographs of a view show; distance: `steps` of its mask. None where the view's frame is not known."""
     if view.frame is None:
         return None
-    lit = view.frame > threshold(view.frame, 1 / view.scale)
+    far = distance > REACH
+    least = threshold(view.frame, 1 / view.scale)
+    if not far.any() or APART * np.median(view.frame[far]) <= least:
+        return _told_apart(view, distance, view.frame, least, True)
+    contrast, scatter = against_wall(view.frame, far)
+    return _told_apart(view, distance, contrast, max(NOISE * scatter, DARKEST / view.scale), False)
+
+
+def against_wall(frame: NDArray[np.float32], far: Bool) -> tuple[NDArray[np.float32], float]:
+    """|b - w| (height, width) and the scatter about w of what is far (height, width), code values."""
+    rows, columns = (np.linspace(-1, 1, size) for size in frame.shape)
+    terms = polyvander2d(*np.meshgrid(rows, columns, indexing="ij"), (2, 2))
+    known, shown = terms[far], frame[far].astype(np.float64)
+    weight = np.ones(len(shown))
+    for _ in range(FITS):
+        root = np.sqrt(weight)
+        wall = np.linalg.lstsq(known * root[:, None], shown * root, rcond=None)[0]
+        away = np.abs(known @ wall - shown)
+        scatter = float(MAD_TO_SIGMA * np.median(away))
+        weight = 1 / (1 + (away / max(CAUCHY_95 * scatter, 1e-6)) ** 2)
+    return np.abs(frame - terms @ wall).astype(np.float32), scatter
+
+
+def _told_apart(view: View, distance: NDArray[np.float32], frame: NDArray[np.float32], least: float, dark: bool) -> Lit:
+    """Object and background by values of pixels (height, width), the object's above `least`."""
+    lit = frame > least
     inner = minimum_filter(lit, 3, mode="nearest")
-    darkest = minimum_filter(np.where(inner, view.frame, np.inf), 3, mode="nearest")
-    half = lit & (inner | np.isinf(darkest) | (view.frame >= PARTIAL * darkest))
+    darkest = minimum_filter(np.where(inner, frame, np.inf), 3, mode="nearest")
+    half = lit & (inner | np.isinf(darkest) | (frame >= PARTIAL * darkest))
     far = distance > REACH
     deep = view.mask & (distance <= np.median(distance[view.mask]))
     judged = bool(lit[deep].mean() >= 1 - FEW and far.any() and lit[far].mean() <= FEW)
-    return Lit(lit, half, _edges(view, view.frame, distance, lit), judged)
+    return Lit(lit, half, _edges(view, frame, distance, lit), judged, dark)
 
 
 def _edges(view: View, frame: NDArray[np.float32], distance: NDArray[np.float32], lit: Bool) -> NDArray[np.float64]:

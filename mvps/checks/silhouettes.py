@@ -74,7 +74,7 @@ def _parted(capture: Capture) -> tuple[Capture, list[Finding]]:
         found = lit_part(view, steps(view.mask))
         if found is None or not found.judged or not view.files:
             return [], []
-        return stray_parts(view.mask, found), missing_parts(view.mask, found)
+        return stray_parts(view.mask, found), missing_parts(view.mask, found) if found.dark else []
 
     parts = on_cores(parts_of, capture.views)
     if not any(stray or missing for stray, missing in parts):
