@@ -53,12 +53,14 @@ long as the residual falls."""
 
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
+    from mvps.camera import pixel_footprint
     from mvps.hull import default_cells, signed_distance, visual_hull
 
     with progress.stage("visual hull") as stage:
         grid = signed_distance(capture, default_cells(capture))
         surface = visual_hull(grid)
-        stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing:.3g} units")
+        pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+        stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing / pixel:.2g} pixels")
     return grid, surface
 
 

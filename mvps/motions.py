@@ -88,4 +88,4 @@ def without_gauge(motions: Float, basis: Float) -> Float:
 def with_motions(capture: Capture, body: Object, motions: Float) -> Capture:
     """The capture after motions (views, 6) of its cameras."""
     views = zip(capture.views, motions, strict=True)
-    return Capture(capture.name, tuple(replace(view, camera=moved(view.camera, body, motion)) for view, motion in views))
+    return Capture(capture.name, tuple(view.taken_by(moved(view.camera, body, motion)) for view, motion in views))

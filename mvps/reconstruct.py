@@ -113,6 +113,7 @@ def reconstruct(
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
+    from mvps.own_units import in_lengths, in_world_units, own_length
     from mvps.plan import Parts, last_pass
     from mvps.pyramid import halvings
 
@@ -123,6 +124,9 @@ def reconstruct(
         from mvps.oneview import reconstruct_view
 
         return reconstruct_view(capture, used, held, settings, lights, parts, progress, findings)
+    length = own_length([view.camera for view in used.views])
+    capture = in_lengths(capture, length)
+    used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
 
     def step(name: str, make: Callable[[], Any]) -> Any:
         return make() if checkpoints is None else checkpoints.step(name, make, progress)
@@ -144,7 +148,8 @@ def reconstruct(
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, chosen_device(settings.device))
         pictures = normal_pictures(capture, used, refined)
-    return told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, findings)
+    result = told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, findings)
+    return in_world_units(result, length)
 
 
 def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, out: Path, progress: Progress) -> None:

@@ -19,6 +19,7 @@ Every class is frozen and checked when it is made; arrays are made read-only, so
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -106,6 +107,12 @@ class View:
         object.__setattr__(self, "samples", checked("samples", self.samples, wanted, np.uint16))
         if not self.scale > 0:
             raise ValueError(f"scale: wanted a positive number, given {self.scale}")
+
+    def taken_by(self, camera: Camera) -> View:
+        """The same photographs by another camera of the same image size; what was worked out of them is shared."""
+        other = copy(self)
+        object.__setattr__(other, "camera", camera)
+        return other
 
     @cached_property
     def pixels(self) -> Int:
