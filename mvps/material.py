@@ -7,8 +7,12 @@ With e_v the mean absolute error of vertex v's held-out samples over their mean 
 
 and a component stays where gain > CERTAIN * noise: vertices are compared with themselves, which takes their differences out of the noise,
 and by ratios, because errors have long tails. Where there are errors of several kinds (of samples in the light, of samples in shadow), one
-must gain by that, and none lose by as much. That surfaces which see each other light each other needs no proof, only its strength does: for
-inter-reflection gain > noise is enough. Left out by chance it makes hollows shallower (docs/method.md).
+must gain by that, and none lose by as much.
+
+That surfaces which see each other light each other needs no proof, and a shallow hollow without that light looks like a deep one with
+it (Nayar, Ikeuchi and Kanade 1991), so that on a surface that is still too shallow samples in the light speak against it. Inter-reflection
+stays unless held-out samples deep in shadow, where nothing else shines, lose by more than CERTAIN * noise; those in the light, where there
+are none in shadow.
 """
 
 from __future__ import annotations
@@ -34,13 +38,6 @@ SHARPENING_STEP, SHARPENING_TOLERANCE, MOST_SHARPENED = 0.35, 0.1, 16
 
 CERTAIN = 3.0
 """Standard errors that a gain must exceed: fewer than one in a hundred runs of half a dozen trials then keeps a component by chance."""
-
-
-LIKELY = 1.0
-"""The same for inter-reflection."""
-
-INTER_REFLECTION = "inter-reflection"
-"""Name of its trial."""
 
 POOR_FIT = 0.1
 """Residual, as a share of the images' signal, above which a model is said to fit badly: albedo and lobes leave 1 to 4 % on matte and glossy
@@ -85,12 +82,12 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     errors = held_out(model)
     trials = []
 
-    def try_out(name: str, add: Callable[[Model], Model]) -> None:
+    def try_out(name: str, add: Callable[[Model], Model], judge: Callable[[str, Float, Float], Trial] = judged) -> None:
         nonlocal model, errors
         start = time.perf_counter()
         trial = add(model)
         with_it = held_out(trial)
-        judgement = judged(name, errors, with_it)
+        judgement = judge(name, errors, with_it)
         trials.append(replace(judgement, seconds=time.perf_counter() - start))
         if judgement.kept:
             model, errors = trial, with_it
@@ -102,7 +99,7 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     if largest.grazing:
         try_out("diffuse term that changes at grazing angles", lambda chosen: replace(chosen, grazing=True))
     if largest.bounce:
-        try_out(INTER_REFLECTION, lambda chosen: replace(chosen, bounce=True))
+        try_out("inter-reflection", lambda chosen: replace(chosen, bounce=True), presumed)
     return model, trials
 
 
@@ -113,21 +110,26 @@ def gained(before: Float, after: Float) -> tuple[float, float]:
     return (float(ratio.mean()), float(ratio.std() / np.sqrt(len(ratio)))) if len(ratio) else (0.0, 0.0)
 
 
-def least_gain(name: str) -> float:
-    """Standard errors that the gain of the component of this name must exceed."""
-    return LIKELY if name == INTER_REFLECTION else CERTAIN
-
-
 def judged(name: str, before: Float, after: Float) -> Trial:
     """The verdict on a component from the errors (n,) without and with it, or from those of several kinds of samples (kinds, n): one must
-    gain, none lose by more than CERTAIN. The account is that of the surest; its time is left at 0."""
-    least = least_gain(name)
-    of_kinds = [gained(b, a) for b, a in zip(np.atleast_2d(before), np.atleast_2d(after), strict=True)]
-    kept = any(gain > least * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
-    # A kind that no vertex has, or that does not change, has no account.
-    told = [of_kind for of_kind in of_kinds if any(of_kind)] or of_kinds
-    gain, noise = max(told, key=lambda of_kind: of_kind[0] - least * of_kind[1])
+    gain, none lose. The account is that of the surest; its time is left at 0."""
+    of_kinds = _of_kinds(before, after)
+    kept = any(gain > CERTAIN * noise for gain, noise in of_kinds) and not any(-gain > CERTAIN * noise for gain, noise in of_kinds)
+    gain, noise = max(of_kinds, key=lambda of_kind: of_kind[0] - CERTAIN * of_kind[1])
     return Trial(name, kept, gain, noise, 0.0)
+
+
+def presumed(name: str, before: Float, after: Float) -> Trial:
+    """As `judged`, of a component that is there unless the last kind of samples that has an account speaks against it. One that changes
+    nothing goes."""
+    gain, noise = _of_kinds(before, after)[-1]
+    return Trial(name, gain != 0 and gain > -CERTAIN * noise, gain, noise, 0.0)
+
+
+def _of_kinds(before: Float, after: Float) -> list[tuple[float, float]]:
+    """Gain and noise of every kind of samples; a kind that no vertex has, or that does not change, has none."""
+    of_kinds = [gained(b, a) for b, a in zip(np.atleast_2d(before), np.atleast_2d(after), strict=True)]
+    return [of_kind for of_kind in of_kinds if any(of_kind)] or of_kinds
 
 
 def sharpened(model: Model, errors: Float, held_out: Callable[[Model], Float]) -> Model:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +29,7 @@ def errors(level: float) -> np.ndarray:
 
 def test_a_component_that_helps_stays_and_one_that_does_not_goes() -> None:
     def held_out(model: Model) -> np.ndarray:
-        return errors(1.0 - 0.2 * (30.0 in model.sharpness) + 0.02 * model.bounce)
+        return errors(1.0 - 0.2 * (30.0 in model.sharpness) + 0.03 * model.bounce)
 
     model, trials = choose(Model((8.0, 30.0), True, True), held_out)
     assert model == Model((30.0,))
@@ -48,16 +47,22 @@ def test_one_kind_of_samples_must_gain_and_none_lose() -> None:
     assert judged("", before, np.stack([0.9 * scatter[0], unsure])).kept
 
 
-def test_inter_reflection_needs_no_proof() -> None:
-    """A gain of two standard errors keeps it, and no other component; one of half a standard error does not."""
+def test_inter_reflection_stays_unless_shadows_speak_against_it() -> None:
+    """By three standard errors; samples in the light only where there are none in shadow. Other components need proof."""
     scatter = np.random.default_rng(0).normal(size=400)
     scatter = (scatter - scatter.mean()) / scatter.std()
+    nowhere = np.full(400, np.nan)
 
-    def held_out(sure: float) -> Callable[[Model], np.ndarray]:
-        return lambda model: np.exp((0.1 * scatter - sure * 0.1 / 20) * ((8.0 in model.sharpness) + model.grazing + model.bounce))
+    def kept(lit: float | None, dark: float | None) -> Model:
+        def held_out(model: Model) -> np.ndarray:
+            added = (8.0 in model.sharpness) + model.grazing + model.bounce
+            return np.stack([nowhere if sure is None else np.exp((0.1 * scatter - sure * 0.1 / 20) * added) for sure in (lit, dark)])
 
-    assert choose(Model((8.0,), True, True), held_out(2.0), sharpen=False)[0] == Model((), False, True)
-    assert choose(Model((8.0,), True, True), held_out(0.5), sharpen=False)[0] == Model()
+        return choose(Model((8.0,), True, True), held_out, sharpen=False)[0]
+
+    with_it, without = Model((), False, True), Model()
+    assert kept(2, 2) == kept(-2, -2) == kept(-9, -2) == kept(-2, None) == with_it
+    assert kept(2, -4) == kept(-4, None) == kept(None, None) == without
 
 
 def test_vertices_without_held_out_samples_do_not_count() -> None:

@@ -16,6 +16,7 @@ from sphere_scene import SphereScene, make_sphere
 
 import mvps.report.page
 from mvps.joint import neural, photometry
+from mvps.rendering import RAYS_ACROSS
 from mvps.report import report_html, write_report
 from mvps.report.charts import light_sphere, line_chart, pair_chart
 from mvps.report.page import LARGEST_BYTES, STYLE, _components, _rounds, _truth

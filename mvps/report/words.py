@@ -8,7 +8,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from mvps.camera import pixel_footprint
-from mvps.material import least_gain
+from mvps.material import CERTAIN
 from mvps.scene import Reconstruction, View
 
 NOT_TRIED = ": not tried, "
@@ -57,17 +57,17 @@ def captured(reconstruction: Reconstruction, views: Sequence[View]) -> list[tupl
 
 def reason(component: Mapping[str, Any]) -> str:
     """Why a component of the reflectance model stays, goes, or was not on trial; nothing where the account does not tell."""
-    name, apart, why = str(component.get("name", "")).partition(NOT_TRIED)
+    _, apart, why = str(component.get("name", "")).partition(NOT_TRIED)
     gain, noise = component.get("gain"), component.get("noise")
     if apart or not is_number(gain) or not is_number(noise):
         return f"not tried: {why}" if apart else ""
     if gain == 0:
         return "the error does not change"
     said = f"the error {'falls' if gain > 0 else 'rises'} by {100 * abs(np.expm1(-gain)):.2g} %"
-    if not component.get("kept") and gain > least_gain(name) * noise:
+    if not component.get("kept") and gain > CERTAIN * noise:
         return f"{said} in the light or in shadow, and rises in the other"
     sure = f"{said}, {abs(gain) / noise:.1f} standard errors" if noise > 0 else f"{said}, everywhere alike"
-    return sure if component.get("kept") or gain < 0 else f"{sure}: that may be chance"
+    return sure if bool(component.get("kept")) == (gain > 0) else f"{sure}: that may be chance"
 
 
 def without_held_out(status: Mapping[str, Any]) -> str:
