@@ -24,6 +24,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from model_normals import model_normal_errors
+
 HERE = Path(__file__).resolve().parent
 
 CASES: dict[str, tuple[str, list[str]]] = {
@@ -48,6 +50,8 @@ COLUMNS = (
     ("intensity %", "intensity_error", 100, 2),
     ("normal map deg", "map_normal_error_deg", 1, 2),
     ("mesh normal deg", "mesh_normal_error_deg", 1, 2),
+    ("model.glb normal deg", "model_normal_error_deg", 1, 2),
+    ("without its map", "model_normal_error_without_map_deg", 1, 2),
     ("Chamfer px", "chamfer_px", 1, 3),
     ("Chamfer mm", "chamfer_mm", 1, 3),
     ("signed offset px", "offset_px", 1, 3),
@@ -96,6 +100,7 @@ def measure(name: str, captures: Path, preset: str, device: str, folder: Path, r
     return {
         "case": name,
         **metrics["truth"],
+        **model_normal_errors(result / "model.glb", capture),
         "seconds": statistics.median(seconds),
         "repeats": repeats,
         "peak_memory_mb": max(peaks),

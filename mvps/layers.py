@@ -23,13 +23,24 @@ from mvps.camera import view_directions
 from mvps.gleam import Senders
 from mvps.illumination import Illumination
 from mvps.mesh import lengths
-from mvps.rendering import Arriving, Points, light_arriving, light_arriving_of_points, points_under, shaded, shadow_at, specular_shading
+from mvps.rendering import (
+    RAYS_ACROSS,
+    Arriving,
+    Points,
+    light_arriving,
+    light_arriving_of_points,
+    points_under,
+    shaded,
+    shadow_at,
+    specular_shading,
+    within_pixels,
+)
 from mvps.scene import Bool, Camera, Float, Int, Material
 from mvps.visibility import RayCaster
 
 Layer = NDArray[np.float32]
 
-SUBPIXELS = 4
+SUBPIXELS = RAYS_ACROSS**2
 """Rays a pixel, in a square."""
 
 MANY_LIGHTS = 16
@@ -89,10 +100,8 @@ def _of_pixels(
     caster: RayCaster, material: Material, camera: Camera, pixels: Int, light: Illumination, layers: Sequence[str], sent: Sent
 ) -> tuple[dict[str, Layer], Layer]:
     """Layers (n[, 3]) of pixels (n,), counted along the rows, 0 where nothing is hit, and coverage (n,)."""
-    side = int(np.sqrt(SUBPIXELS))
-    fine = Camera(np.diag([side, side, 1.0]) @ camera.K, camera.rotation, camera.translation, side * camera.height, side * camera.width)
-    corners, within = (np.stack(np.divmod(a, b), -1) for a, b in ((pixels, camera.width), (np.arange(SUBPIXELS), side)))
-    points = points_under(caster, material, fine, (side * corners + within[:, None]).reshape(-1, 2))
+    fine, rays = within_pixels(camera, np.stack(np.divmod(pixels, camera.width), -1), RAYS_ACROSS)
+    points = points_under(caster, material, fine, rays.reshape(-1, 2))
     found: dict[str, NDArray[Any]] = {"albedo": points.albedo, "normals": points.normal, "confidence": points.confidence}
     found["depth"] = np.where(points.hit, (points.position @ camera.rotation.T + camera.translation)[:, 2], 0)
     hit = points.hit.reshape(SUBPIXELS, -1)

@@ -46,7 +46,7 @@ def render_view(
     """
     import numpy as np
 
-    from mvps.rendering import light_arriving, photograph
+    from mvps.rendering import RAYS_ACROSS, light_arriving, photograph
     from mvps.scene import CaptureError
     from mvps.visibility import camera_hits
 
@@ -62,7 +62,7 @@ def render_view(
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(chosen), step):
         part = chosen[start : start + step]
-        radiance = photograph(caster, reconstruction.material, camera, every[part], direction, intensity, arriving)
+        radiance = photograph(caster, reconstruction.material, camera, every[part], direction, intensity, arriving, RAYS_ACROSS)
         image[part] = np.rint((radiance * WHITE).clip(0, WHITE)).astype(np.uint16)
     return image.reshape(camera.height, camera.width, -1, 3), hit.reshape(camera.height, camera.width)
 

@@ -49,6 +49,18 @@ class Points(NamedTuple):
         return Points(*(values[rows] for values in self))
 
 
+RAYS_ACROSS = 2
+"""Rays along a pixel's side in pictures that stand beside photographs, whose pixels are means over their area too. Of bunny's views held
+out one shows 34.3 dB, two 34.9, three 34.9."""
+
+
+def within_pixels(camera: Camera, pixels: Int, side: int) -> tuple[Camera, Int]:
+    """A camera of `side` times the resolution, and the row and column (side^2, n, 2) of its pixels within pixels (n, 2)."""
+    fine = Camera(np.diag([side, side, 1.0]) @ camera.K, camera.rotation, camera.translation, side * camera.height, side * camera.width)
+    within = np.stack(np.divmod(np.arange(side**2), side), -1)
+    return fine, side * pixels + within[:, None]
+
+
 def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: Int) -> Points:
     """What the centres of pixels (n, 2), row and column, see. Where nothing is hit, all values are 0 and `hit` is False."""
     surface = caster.surface
@@ -149,21 +161,37 @@ def photograph(
     direction: Float,
     intensity: Float,
     arriving: Arriving | None = None,
+    side: int = 1,
 ) -> NDArray[np.float32]:
-    """Radiance (n, lights, 3) at the centres of pixels (n, 2) under lights direction, intensity (lights, 3); 0 where nothing is hit.
+    """Radiance (n, lights, 3) of pixels (n, 2) under lights direction, intensity (lights, 3): mean of side^2 rays through each; a ray that
+    hits nothing brings 0.
 
     arriving: inter-reflection under the same lights, for the same camera.
     """
-    points = points_under(caster, material, camera, pixels)
+    fine, rays = within_pixels(camera, pixels, side)
+    image = np.zeros((len(pixels), len(direction), 3), np.float32)
+    for of_rays in rays:
+        _add_rays(image, points_under(caster, material, fine, of_rays), caster, material, fine, direction, arriving)
+    return image * (intensity / side**2).astype(np.float32)
+
+
+def _add_rays(
+    image: NDArray[np.float32],
+    points: Points,
+    caster: RayCaster,
+    material: Material,
+    camera: Camera,
+    direction: Float,
+    arriving: Arriving | None,
+) -> None:
+    """Adds to an image (n, lights, 3) what points show under lights of unit intensity."""
     view = view_directions(camera, points.position)
     lit = ~shadow_at(caster, material.law, points, direction)
-    image = np.empty((len(pixels), len(direction), 3), np.float32)
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
-    for start in range(0, len(pixels), step):
+    for start in range(0, len(image), step):
         part = slice(start, start + step)
         of_part = points.part(part)
-        image[part] = shaded(of_part, view[part], material, direction) * lit[part, :, None]
+        image[part] += shaded(of_part, view[part], material, direction) * lit[part, :, None]
         if arriving is not None:
             of_albedo, of_lobes = arriving.at(of_part)
             image[part] += of_part.albedo[:, None].astype(np.float32) * of_albedo + of_lobes
-    return image * intensity.astype(np.float32)

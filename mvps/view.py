@@ -283,10 +283,10 @@ def main(argv: Sequence[str]) -> None:
         raise CaptureError(f"--port {given.port}: wanted a free one, given {error.strerror}; choose another --port") from error
     with serving:
         address = f"http://127.0.0.1:{serving.server_port}/"
-        print(f"{address}  (Ctrl-C ends)", flush=True)
-        if not given.no_browser:
-            webbrowser.open(address)
         try:
+            print(f"{address}  (Ctrl-C ends)", flush=True)
+            if not given.no_browser:
+                webbrowser.open(address)
             serving.serve_forever()
         except KeyboardInterrupt as ended:
             # Ctrl-C is how it ends; other signals are not.

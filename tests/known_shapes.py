@@ -7,7 +7,7 @@ import numpy as np
 
 from mvps import measures
 from mvps.mesh import vertex_normals
-from mvps.rendering import photograph
+from mvps.rendering import RAYS_ACROSS, photograph
 from mvps.scene import Camera, Capture, Lights, Material, Reconstruction, Surface, Truth, View
 from mvps.visibility import RayCaster
 
@@ -83,7 +83,7 @@ def photographed(noise: float, gain: float) -> tuple[Surface, Material, dict[mea
         # Near the camera: hardly a pixel so dark that noise is cut off at zero.
         direction = np.array([[0, 0, -1.0], [0.1, 0, -np.sqrt(0.99)], [0, 0.1, -np.sqrt(0.99)]]) @ v.camera.rotation
         intensity = np.array([[1, 1, 1], [0.7, 0.8, 0.9], [1.2, 1.1, 1.0]])
-        image = photograph(caster, material, v.camera, v.pixels, direction, intensity)
+        image = photograph(caster, material, v.camera, v.pixels, direction, intensity, side=RAYS_ACROSS)
         noisy = np.clip(image + rng.normal(0, noise, image.shape), 0, 1)
         views.append(view(v.name, v.camera, v.mask, np.rint(noisy * 65535).astype(np.uint16)))
         known |= {(v.name, k + 1): (direction[k], gain * intensity[k]) for k in range(3)}

@@ -46,10 +46,11 @@ def make_sphere(
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
     seen_from: Sequence[Sequence[float]] = AXES,
     waves: float = 0.1,
+    side: int = 1,
 ) -> SphereScene:
     """Views from these directions, ten lights of one rig; the refined normals are waves on the sphere's, up to about 10 degrees off.
 
-    tint: colour of the lobes where they are coloured; waves: radians.
+    tint: colour of the lobes where they are coloured; waves: radians; side: rays along a pixel's side.
     """
     rng = np.random.default_rng(seed)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
@@ -69,7 +70,7 @@ def make_sphere(
         hits = camera_hits(caster, camera, pixels)
         mask = (hits.face >= 0).reshape(camera.height, camera.width)
         direction = normalise(rig @ camera.rotation)
-        radiance = photograph(caster, material, camera, pixels[mask.ravel()], direction, intensity)
+        radiance = photograph(caster, material, camera, pixels[mask.ravel()], direction, intensity, side=side)
         samples = np.rint((radiance / 2).clip(0, 1) * 65535).astype(np.uint16)
         views.append(View(f"view_{k + 1:02d}", camera, mask, samples, 2 / 65535, 65535, tuple(range(1, 11))))
         directions.append(direction)

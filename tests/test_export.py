@@ -21,8 +21,11 @@ from mvps.folders import appearing_whole
 from mvps.mesh import decimated
 from mvps.meshfile import read_ply
 from mvps.pbr import reflectance_scale
-from mvps.scene import CaptureError, Material, Reconstruction
+from mvps.scene import CaptureError, Material, Reconstruction, Truth
 from mvps.texture import Textures, bake
+from mvps.visibility import camera_hits, interpolate, ray_caster
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
@@ -170,6 +173,31 @@ def test_glb_read_back_by_trimesh(scene: SphereScene, textures: Textures, folder
     np.testing.assert_array_equal(np.asarray(material.normalTexture)[..., :3], textures.normal_map)
     np.testing.assert_array_equal(np.asarray(material.metallicRoughnessTexture)[..., 1], textures.roughness)
     assert material.metallicFactor == 0 and (np.asarray(material.metallicRoughnessTexture)[..., 2] == 0).all()
+
+
+def test_the_benchmark_reads_the_normals_that_the_model_holds(
+    scene: SphereScene, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At pixels, the file's normal map gives the refined normals, which are waves of six degrees, and the mesh alone does not."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from model_normals import model_normal_errors
+
+    r, capture = scene.reconstruction, tmp_path / "capture"
+    pictures = []
+    for view in scene.capture.views:
+        hits = camera_hits(ray_caster(r.surface), view.camera, view.pixels)
+        normal = interpolate(r.surface, hits, r.material.normal)
+        picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
+        picture[view.mask] = np.where(
+            hits.face[:, None] >= 0, normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9), np.nan
+        )
+        pictures.append(picture)
+    names = [view.name for view in scene.capture.views]
+    truth = Truth(tuple(names), dict(zip(names, pictures, strict=True)), {}, {}, None)
+    monkeypatch.setattr("model_normals.read_truth", lambda _: truth)
+    monkeypatch.setattr("model_normals.read_capture", lambda *_, **__: scene.capture)
+    errors = model_normal_errors(folder / "model.glb", capture)
+    assert errors["model_normal_error_deg"] < 1 < 3 < errors["model_normal_error_without_map_deg"]
 
 
 def test_obj_read_back_by_trimesh(scene: SphereScene, textures: Textures, folder: Path) -> None:

@@ -17,6 +17,7 @@ from mvps.command import run
 from mvps.export import write_reconstruction
 from mvps.load import read_environment
 from mvps.render import main, render_view
+from mvps.rendering import RAYS_ACROSS
 from mvps.scene import Camera, CaptureError, Lights, Truth, View
 from mvps.synthetic.files import write_capture
 from mvps.viewpoints import look_at
@@ -33,7 +34,7 @@ def as_read(view: View) -> View:
 @pytest.fixture(scope="module")
 def scene() -> SphereScene:
     """Two views, intensities in units in which white is 1, as after reading the photographs from files."""
-    made = make_sphere(3)
+    made = make_sphere(3, side=RAYS_ACROSS)
     r = made.reconstruction
     views = made.capture.views[:2]
     lights = Lights(r.lights.direction[:2], tuple(e / SPAN for e in r.lights.intensity[:2]), True)

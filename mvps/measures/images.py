@@ -29,7 +29,7 @@ def rendered(
     surface: Surface, material: Material, lights: Mapping[Photograph, Light], capture: Capture
 ) -> Iterator[tuple[View, list[int], NDArray[np.float32]]]:
     """View by view: the view, the positions of its photographs that `lights` names, and their rendering (pixels, positions, 3)."""
-    from mvps.rendering import light_arriving, light_senders, photograph
+    from mvps.rendering import RAYS_ACROSS, light_arriving, light_senders, photograph
 
     caster, senders = ray_caster(surface), light_senders(surface, material)
     for view in capture.views:
@@ -37,7 +37,7 @@ def rendered(
         if kept:
             direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
             arriving = light_arriving(senders, direction, view.camera.centre)
-            yield view, kept, photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)
+            yield view, kept, photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving, RAYS_ACROSS)
 
 
 def photograph_errors(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.gleam import Senders
 from mvps.pbr import reflectance_scale, srgb_bytes
-from mvps.rendering import light_arriving, photograph, points_under, shadow_at
+from mvps.rendering import RAYS_ACROSS, light_arriving, photograph, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View, expected_error_deg
 from mvps.visibility import RayCaster
 
@@ -50,9 +50,9 @@ def view_pictures(caster: RayCaster, senders: Senders | None, reconstruction: Re
     material = reconstruction.material
     measured = view.radiance([chosen])[:, 0]
     arriving = light_arriving(senders, direction, view.camera.centre)
-    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving)[:, 0]
+    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving, RAYS_ACROSS)[:, 0]
     dark = replace(material, albedo=np.zeros_like(material.albedo))
-    specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity)[:, 0]
+    specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity, side=RAYS_ACROSS)[:, 0]
     points = points_under(caster, material, view.camera, view.pixels)
     cast = shadow_at(caster, material.law, points, direction)[:, 0]
     attached = points.normal @ direction[0] <= 0
