@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import erf
 from sphere_scene import make_sphere
 from test_agreement import true_maps
 
-from mvps.joint.fused import NORMAL_SIGMA, SHARED_SIGMA, face_targets
+from mvps.joint.fused import NORMAL_SIGMA, SHARED_SIGMA, SHARPENING, _sharpened, face_targets
 from mvps.joint.observe import visible_in
-from mvps.mesh import normalise
-from mvps.scene import Capture
+from mvps.mesh import angles_deg, normalise
+from mvps.scene import Capture, Surface
 
 SCENE = make_sphere(4)
 SURFACE = SCENE.reconstruction.surface
@@ -49,3 +50,47 @@ def test_of_one_view_or_few_lights_nothing_is_told() -> None:
     assert (sigmas(0.0, one, SEEN[:1], 1) == NORMAL_SIGMA).all()
     few = SCENE.capture.select({view.name: view.lights[:2] for view in SCENE.capture.views})
     assert (sigmas(0.0, few, SEEN, 1) == NORMAL_SIGMA).all()
+
+
+def test_exact_normals_of_a_ball_stay() -> None:
+    """They are the same where they are means around."""
+    plain = make_sphere(4, waves=0)
+    found = face_targets(plain.capture, SURFACE, tuple(true_maps(plain)), SEEN, normalise(SURFACE.vertices)).normal
+    true = normalise(normalise(SURFACE.vertices)[SURFACE.faces].sum(1))
+    assert angles_deg(found[VIEWS >= 2], true[VIEWS >= 2]).mean() < 0.3
+
+
+N = 12
+X, Y = (of.ravel() for of in np.meshgrid(np.arange(-N, N + 1.0), np.arange(-N, N + 1.0), indexing="ij"))
+
+
+def sheet(z: np.ndarray) -> tuple[Surface, np.ndarray, np.ndarray]:
+    """A square mesh of heights z (V,), the x of its faces' centres, and which faces are not near its border."""
+    number = np.arange(len(X)).reshape(2 * N + 1, 2 * N + 1)
+    a, b, c, d = (number[i : 2 * N + i, j : 2 * N + j].ravel() for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)))
+    made = Surface(np.stack([X, Y, z], 1), np.concatenate([np.stack([a, b, c], 1), np.stack([d, c, b], 1)]))
+    centre = made.vertices[made.faces].mean(1)
+    return made, centre[:, 0], np.abs(centre[:, :2]).max(1) < N - 2
+
+
+def test_a_blurred_ridge_is_sharpened() -> None:
+    """Of two planes at a right angle, seen as a mean with a standard deviation of 0.6 along x: along the slope lengths are longer."""
+    ridge, x, inner = sheet(-np.abs(X))
+    blurred = normalise(np.stack([erf(x / (0.6 * np.sqrt(2))), 0 * x, np.ones_like(x)], 1))
+    true = normalise(np.stack([np.sign(x), 0 * x, np.ones_like(x)], 1))
+    everywhere = np.ones(len(x))
+    found = _sharpened(blurred, 2 * 0.6**2 / SHARPENING * everywhere, 0 * everywhere, everywhere > 0, ridge)
+    near = inner & (np.abs(x) < 1.5)
+    assert angles_deg(found[near], true[near]).mean() < 0.65 * angles_deg(blurred[near], true[near]).mean()
+
+
+def test_what_is_error_alone_is_not_sharpened() -> None:
+    flat, x, inner = sheet(0 * X)
+    up = np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))
+    given = normalise(up + np.random.default_rng(5).normal(0, 0.05, up.shape) * [1, 1, 0])
+    blur, error = np.full((2, len(x)), [[0.5], [0.05**2]])
+    found = _sharpened(given, blur, error, error > 0, flat)
+    # Knowing nothing of errors, the same blur makes them half as large again.
+    believed = _sharpened(given, blur, 0 * error, error > 0, flat)
+    plain, kept, blown = (angles_deg(of[inner], up[inner]).mean() for of in (given, found, believed))
+    assert kept < 1.15 * plain and blown > 1.3 * plain
