@@ -73,9 +73,12 @@ def sheet(z: np.ndarray) -> tuple[Surface, np.ndarray, np.ndarray]:
     return made, centre[:, 0], np.abs(centre[:, :2]).max(1) < N - 2
 
 
-def test_a_blurred_ridge_is_sharpened() -> None:
-    """Of two planes at a right angle, seen as a mean with a standard deviation of 0.6 along x: along the slope lengths are longer."""
+@pytest.mark.parametrize("away", [0.0, 1e7])
+def test_a_blurred_ridge_is_sharpened(away: float) -> None:
+    """Of two planes at a right angle, seen as a mean with a standard deviation of 0.6 along x (along the slope lengths are longer), anywhere
+    in the world."""
     ridge, x, inner = sheet(-np.abs(X))
+    ridge = Surface(ridge.vertices + away, ridge.faces)
     blurred = normalise(np.stack([erf(x / (0.6 * np.sqrt(2))), 0 * x, np.ones_like(x)], 1))
     true = normalise(np.stack([np.sign(x), 0 * x, np.ones_like(x)], 1))
     everywhere = np.ones(len(x))

@@ -129,8 +129,8 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
     target[unknown] = normalise(otherwise[faces[unknown]].sum(1))
     count = weights**2 / np.maximum(squares, LEAST_WEIGHT**2)
     scatter = (1 - lengths(total) / np.maximum(weights, LEAST_WEIGHT)).clip(0)
-    known, variance = count >= LEAST_VIEWS, scatter * count / np.maximum(count - 1, LEAST_VIEWS - 1)
-    error = _around(variance, known, surface) / np.maximum(count, 1)
+    known = count >= LEAST_VIEWS
+    error = _around(scatter * count / np.maximum(count - 1, LEAST_VIEWS - 1), known, surface) / np.maximum(count, 1)
     # Of few lights the maps hold the mesh's own normals (pixels.py), about which views are of one mind.
     sigma = np.inf if few_lights(capture) else np.sqrt(error + SHARED_SIGMA**2)
     blur *= PIXEL_BLUR / np.maximum(weights, LEAST_WEIGHT)
@@ -139,7 +139,8 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
 
 def _sharpened(normal: Float, blur: Float, error: Float, known: Bool, surface: Surface) -> Float:
     """Normals (F, 3), unit, without their blur (F,); error (F,) of theirs along a tangent, NaN where not known."""
-    centre = surface.vertices[surface.faces].mean(1)
+    # About the middle: squares of places far from it would swallow what faces lie apart.
+    centre = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0)
     near = _mean_around(np.column_stack([normal, centre, (centre**2).sum(1)]), surface)
     spread = (near[:, 6] - 2 * (near[:, 3:6] * centre).sum(1) + (centre**2).sum(1)) / 2
     away = normal - near[:, :3]
