@@ -75,8 +75,8 @@ def sheet(z: np.ndarray) -> tuple[Surface, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("away", [0.0, 1e7])
 def test_a_blurred_ridge_is_sharpened(away: float) -> None:
-    """Of two planes at a right angle, seen as a mean with a standard deviation of 0.6 along x, anywhere in the world. Along the slope lengths
-    are longer."""
+    """Of two planes at a right angle, seen as a mean with a standard deviation of 0.6 along x, anywhere in the world. Along the slope
+    lengths are longer."""
     ridge, x, inner = sheet(-np.abs(X))
     ridge = Surface(ridge.vertices + away, ridge.faces)
     blurred = normalise(np.stack([erf(x / (0.6 * np.sqrt(2))), 0 * x, np.ones_like(x)], 1))
