@@ -104,10 +104,14 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
 
 
 def gained(before: Float, after: Float) -> tuple[float, float]:
-    """Gain and noise, as above, of errors (n,) over errors (n,), of those that differ; 0 where none do."""
+    """Gain and noise, as above, of errors (n,) over errors (n,), of those that differ; 0 where none do. One alone has no scatter: its noise
+    is as much as it gains or loses, which proves nothing."""
     both = (before > 0) & (after > 0) & (before != after)
     ratio = np.log(before[both] / after[both])
-    return (float(ratio.mean()), float(ratio.std() / np.sqrt(len(ratio)))) if len(ratio) else (0.0, 0.0)
+    if not len(ratio):
+        return 0.0, 0.0
+    gain = float(ratio.mean())
+    return gain, float(ratio.std() / np.sqrt(len(ratio))) if len(ratio) > 1 else abs(gain)
 
 
 def judged(name: str, before: Float, after: Float) -> Trial:

@@ -15,7 +15,7 @@ from mvps.joint.observe import observe
 from mvps.joint.photometry import grey_lights
 from mvps.joint.steps import free_reflectance
 from mvps.joint.trial import held_out_errors
-from mvps.material import SHARPENED, Model, choose, judged
+from mvps.material import SHARPENED, Model, choose, judged, presumed
 from mvps.scene import Law
 
 CPU = torch.device("cpu")
@@ -63,6 +63,15 @@ def test_inter_reflection_stays_unless_shadows_speak_against_it() -> None:
     with_it, without = Model((), False, True), Model()
     assert kept(2, 2) == kept(-2, -2) == kept(-9, -2) == kept(-2, None) == with_it
     assert kept(2, -4) == kept(-4, None) == kept(None, None) == without
+
+
+@pytest.mark.parametrize("factor", [0.01, 100.0])
+def test_one_vertex_alone_proves_nothing(factor: float) -> None:
+    before, after = np.ones(50), np.full(50, np.nan)
+    after[7] = factor
+    assert not judged("", before, after).kept and presumed("", before, after).kept
+    others = np.exp(np.random.default_rng(0).normal(-0.5, 0.3, 50))
+    assert judged("", np.ones((2, 50)), np.stack([others, after])).kept
 
 
 def test_vertices_without_held_out_samples_do_not_count() -> None:
