@@ -15,27 +15,22 @@ import numpy as np
 from glb import Array, Model, read_glb
 
 from mvps.load import read_capture, read_truth
+from mvps.mesh import angles_deg, normalise
 from mvps.scene import Int, Surface
 from mvps.visibility import Hits, camera_hits, interpolate, ray_caster
-
-
-def unit(vectors: Array) -> Array:
-    """Vectors (n, 3) of length one."""
-    length: Array = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / np.maximum(length, 1e-30)
 
 
 def normals_at(model: Model, surface: Surface, hits: Hits) -> tuple[Array, Array]:
     """(n, 3) unit normals with the normal map, and without it, at hits on the model's own mesh."""
     normal, tangent, uv = (interpolate(surface, hits, of.astype(float)) for of in (model.normal, model.tangent, model.uv))
-    n = unit(normal)
-    t = unit(tangent[:, :3] - (tangent[:, :3] * n).sum(1, keepdims=True) * n)
+    n = normalise(normal)
+    t = normalise(tangent[:, :3] - (tangent[:, :3] * n).sum(1, keepdims=True) * n)
     b = np.cross(n, t) * np.sign(tangent[:, 3:])
     place = (uv * np.array(model.bump.shape[1::-1]) - 0.5).astype(np.float32)
     # OpenCV's maps have 32767 rows at most.
     parts = [cv2.remap(model.bump, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for x, y in _rows(place)]
     c = 2 * np.concatenate(parts).reshape(-1, 3) - 1
-    return unit(c[:, :1] * t + c[:, 1:2] * b + c[:, 2:] * n), n
+    return normalise(c[:, :1] * t + c[:, 1:2] * b + c[:, 2:] * n), n
 
 
 def _rows(place: Array, most: int = 30000) -> list[tuple[Array, Array]]:
@@ -54,6 +49,6 @@ def model_normal_errors(file: Path, capture: Path) -> dict[str, float]:
         hits = camera_hits(caster, view.camera, view.pixels[known])
         hit: Int = np.flatnonzero(hits.face >= 0)
         seen = Hits(hits.face[hit], hits.barycentric[hit], hits.distance[hit])
-        found.append([np.degrees(np.arccos(np.clip((of * true[known][hit]).sum(1), -1, 1))) for of in normals_at(model, surface, seen)])
+        found.append([angles_deg(of, true[known][hit].astype(float)) for of in normals_at(model, surface, seen)])
     mapped, bare = (float(np.concatenate(of).mean()) for of in zip(*found, strict=True))
     return {"model_normal_error_deg": mapped, "model_normal_error_without_map_deg": bare}

@@ -125,8 +125,8 @@ def reconstruct(
 
         return reconstruct_view(capture, used, held, settings, lights, parts, progress, findings)
     length = own_length([view.camera for view in used.views])
-    capture = in_lengths(capture, length)
-    used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    capture, used = in_lengths(capture, length), in_lengths(used, length)
+    held = held and in_lengths(held, length)
 
     def step(name: str, make: Callable[[], Any]) -> Any:
         return make() if checkpoints is None else checkpoints.step(name, make, progress)

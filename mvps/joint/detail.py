@@ -23,7 +23,7 @@ from mvps.joint.agreement import Agreement
 from mvps.joint.fused import NORMAL_SIGMA, face_targets
 from mvps.joint.vertices import Moved, fuse
 from mvps.mesh import edges, lengths, normalise, split_edges, unbiased, vertex_normals
-from mvps.scene import Capture, Int, Material, NormalMap, Surface
+from mvps.scene import Capture, Float, Int, Material, NormalMap, Surface
 
 OPPOSITE = 1e-3
 """Length of the mean of two unit normals below which it says nothing."""
@@ -60,6 +60,12 @@ def detailed(capture: Capture, coarse: Moved, maps: tuple[NormalMap, ...], seen:
     return Detailed(unbiased(fuse(surface, target.normal, Agreement(offset, spread), target.sigma)[0]), share)
 
 
+def directions(mean: Float, surface: Surface) -> Float:
+    """Unit normals (V, 3) from means of unit normals (V, 3); where these were opposite there is no mean, and the surface's own stay."""
+    told = lengths(mean) > OPPOSITE
+    return np.where(told[:, None], normalise(mean), vertex_normals(surface))
+
+
 def interpolated(material: Material, of: Detailed) -> Material:
     """The material on the finer surface's vertices."""
     share = of.share
@@ -68,12 +74,10 @@ def interpolated(material: Material, of: Detailed) -> Material:
         mixed: NDArray[Any] = share @ values.reshape(len(values), math.prod(values.shape[1:]))
         return mixed.reshape(share.shape[0], *values.shape[1:]).astype(values.dtype)
 
-    residual, mean = material.residual, at(material.normal)
-    # Of two opposite normals there is no mean.
-    opposite = lengths(mean) < OPPOSITE
+    residual = material.residual
     return replace(
         material,
-        normal=np.where(opposite[:, None], vertex_normals(of.surface), normalise(mean)),
+        normal=directions(at(material.normal), of.surface),
         albedo=at(material.albedo),
         specular_weight=at(material.specular_weight),
         confidence=at(material.confidence),

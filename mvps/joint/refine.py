@@ -19,7 +19,7 @@ from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
-from mvps.joint.detail import OPPOSITE, detailed, interpolated
+from mvps.joint.detail import detailed, directions, interpolated
 from mvps.joint.fused import face_targets
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
@@ -43,7 +43,7 @@ from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
 from mvps.memory import room_for
-from mvps.mesh import edges, isotropic_remesh, lengths, normalise, split_edges, unbiased, vertex_normals
+from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 from mvps.silhouette import mask_distances
 
@@ -252,11 +252,7 @@ def refine(
 def shaded_as(material: Material, surface: Surface) -> Material:
     """The material with normals halfway to those of its surface: a vertex's come from all lights at the vertex, the surface's from what
     pixels around show and views agree on, sharpened; they err about as much, and not alike."""
-    own = vertex_normals(surface)
-    both = material.normal + own
-    # Of two opposite normals there is no middle.
-    told = lengths(both) > OPPOSITE
-    return replace(material, normal=np.where(told[:, None], normalise(both), own))
+    return replace(material, normal=directions((material.normal + vertex_normals(surface)) / 2, surface))
 
 
 def _coloured(state: State, settings: RefineSettings, generator: np.random.Generator) -> Material:

@@ -277,7 +277,7 @@ def _components(components: Sequence[Mapping[str, Any]]) -> str:
     names = {"name": "component", "kept": "kept", "why": "why", "seconds": "time, s"}
     said = (
         "<p>While the model is chosen, some lights of every view are kept back. A component stays if it lowers the error on them by more"
-        " than three standard errors, inter-reflection if by more than one.</p>"
+        " than three standard errors; inter-reflection, which needs no proof, unless samples in shadow speak against it by as much.</p>"
     )
     return _section("Reflectance model", said + _columns(rows, names))
 
