@@ -101,15 +101,17 @@ def told(
 ) -> Reconstruction:
     """The result with the account of how it came about, and whether it is to be trusted.
 
-    used: what it was made from; settings: plain values; complete, pictures: lights and normals of all views; findings: of the capture's
-    checks; words: to end the verdict with.
+    used: what it was made from; settings: plain values; complete, pictures: lights and normals of all views, of those used their pixels'
+    own, which the verdict compares and the result draws to the surface; findings: of the capture's checks; words: to end the verdict with.
     """
     from mvps.measures import held_out_photographs, held_out_views, photograph_errors
     from mvps.nearness import nearness
     from mvps.verdict import signs, verdict
+    from mvps.view_normals import drawn_to_surface
 
     with progress.stage("verdict") as stage:
-        of_used = [picture for view, picture in zip(capture.views, pictures, strict=True) if view.name in {v.name for v in used.views}]
+        names = [view.name for view in capture.views]
+        of_used = [pictures[names.index(view.name)] for view in used.views]
         found = signs(used, refined.surface, refined.material, of_used, refined.unexplained)
         status, text = verdict(found, (refined.status, refined.text), findings)
         # Normals of one view may be right, and heights wrong all the same.
@@ -119,6 +121,7 @@ def told(
             said = "brightness falls off across the object as it does under near lights, which are taken for directional ones: normals lean"
             findings = [*findings, Finding("lights", "all views", f"{said} ({near.slope:.3f}, far lights 0)", False)]
             text = f"{text} But {said}."
+        drawn = dict(zip((view.name for view in used.views), drawn_to_surface(used, refined.surface, of_used), strict=True))
         stage.status(status)
     metrics = {"stages": progress.stages, "rounds": rounds, "status": {"name": status, "text": f"{text} {words}".strip(), **found}}
     metrics["findings"] = [asdict(one) for one in findings]
@@ -134,11 +137,12 @@ def told(
         refined.surface,
         refined.material,
         complete,
-        tuple(view.name for view in capture.views),
+        tuple(names),
         tuple(view.lights for view in capture.views),
-        pictures,
+        tuple(drawn.get(name, picture) for name, picture in zip(names, pictures, strict=True)),
         metrics,
         {**settings, "versions": versions()},
+        pictures,
     )
     photographs = held_out_photographs(result)
     if not photographs:

@@ -169,7 +169,7 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
         surface = reconstruction.surface
         fewer = [faces for faces in settings.faces if faces < len(surface.faces)]
         shells = {faces: shell for faces in fewer if (shell := decimated(surface, faces)) is not None}
-        maps = [reconstruction.normal_maps[reconstruction.views.index(view.name)] for view in part.views]
+        maps = [reconstruction.own_normals[reconstruction.views.index(view.name)] for view in part.views]
         textures, *levels = bake(surface, reconstruction.material, lights, part, density, tuple(shells.values()), maps)
         off = fit_error(reconstruction.material.specular_weight, reconstruction.material.law)
         said = [f"glTF's highlights are {100 * off:.0f} % off ours" if off else "no highlights"]

@@ -45,13 +45,14 @@ class CaptureError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera. K (3, 3) pixels; rotation (3, 3) and translation (3,) are camera_from_world."""
+    """A pinhole camera: K (3, 3) pixels; rotation (3, 3), translation (3,) camera_from_world; a lens's k1 to k5 are for checks/lens.py."""
 
     K: Float
     rotation: Float
     translation: Float
     height: int
     width: int
+    distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name, shape in (("K", (3, 3)), ("rotation", (3, 3)), ("translation", (3,))):
@@ -217,7 +218,6 @@ class Capture:
 
 RELIABLE = 0.2
 """Standard deviation of a normal, radians, at which its confidence is one half: there it no longer tells a slope from flat ground.
-
 confidence = 1 / (1 + (sigma / RELIABLE)^2) with sigma the standard deviation along either tangent."""
 
 
@@ -268,11 +268,6 @@ class Surface:
             raise ValueError("faces: wanted at least one, given none")
         if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
             raise ValueError(f"faces: wanted indices in 0..{len(self.vertices) - 1}, given {self.faces.min()}..{self.faces.max()}")
-
-
-GRAZING_POWER = 3
-"""Of (1 - cosine) in the diffuse term's grazing factor (shading.py). Measured falloffs of two materials ask for 3 and 4 (docs/method.md);
-Schlick's dielectrics have 5."""
 
 
 @dataclass(frozen=True)
@@ -375,6 +370,7 @@ class Reconstruction:
     lights       of every view in `views`, including held-out photographs
     light_names  per view the numbers of its lights, counted from 1
     normal_maps  per view (height, width, 3) float32 world frame, NaN outside the mask
+    own_normals  the same by the pixels alone, not drawn to the surface (view_normals.py), for textures; none where read from files
     metrics      time and memory per stage, residuals, status in words; plain JSON values
     settings     everything needed to run it again; plain JSON values
     """
@@ -387,6 +383,7 @@ class Reconstruction:
     normal_maps: tuple[NDArray[np.float32], ...]
     metrics: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
+    own_normals: tuple[NDArray[np.float32], ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.material.albedo) != len(self.surface.vertices):

@@ -29,7 +29,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvps.scene import GRAZING_POWER, Float, Law
+from mvps.scene import Float, Law
+
+GRAZING_POWER = 3
+"""Of (1 - cosine) in the diffuse term's grazing factor. Measured falloffs of two materials ask for 3 and 4 (docs/method.md); Schlick's
+dielectrics have 5."""
 
 QUADRATURE = 64
 """Nodes of Gauss and Legendre: enough for sharpness up to 10^4."""

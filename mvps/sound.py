@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 from mvps.checks.ambient import ambient
 from mvps.checks.contents import contents
+from mvps.checks.lens import lens
 from mvps.checks.photographs import photographs
 from mvps.checks.poses import poses
 from mvps.checks.radiometry import curve_undone
@@ -21,9 +22,10 @@ from mvps.scene import Capture
 
 Check = Callable[[Capture], tuple[Capture, list[Finding]]]
 
-CHECKS: Sequence[Check] = (contents, silhouettes, curve_undone, photographs, ambient, poses)
-"""In their order: whether there is anything at all; what the object is in every view, for which photographs may be read again; their
-values; what does not belong, and what all have in common; where the cameras are, which trusts masks and photographs."""
+CHECKS: Sequence[Check] = (contents, lens, silhouettes, curve_undone, photographs, ambient, poses)
+"""In their order: whether there is anything at all; whether photographs are a pinhole's; what the object is in every view, for which
+photographs may be read again; their values; what does not belong, and what all have in common; where the cameras are, which trusts masks
+and photographs."""
 
 
 def sound(capture: Capture, progress: Progress) -> tuple[Capture, list[Finding]]:

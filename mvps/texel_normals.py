@@ -47,13 +47,14 @@ def texel_normals(surface: Surface, places: Places, own: Float, shown: Shown) ->
     mean = np.where(told[:, None], shown.total / np.where(told, length, 1)[:, None], own)
     noise = (1 - length / np.where(told, shown.weight, 1)).clip(0) / np.maximum(count - 1, LEAST_VIEWS - 1)
     apart = ((mean - own) ** 2).sum(1) / 2
-    noise, apart = _around(surface, places, np.stack([noise, apart], 1), told).T
+    noise, apart = around(surface, places, np.stack([noise, apart], 1), told).T
     part = (1 - noise / np.maximum(apart, 1e-12)).clip(0, 1) * told
     return normalise(own + part[:, None] * (mean - own))
 
 
-def _around(surface: Surface, places: Places, values: Float, known: Bool) -> Float:
-    """(n, k) values (n, k) of the points that are known, in the mean over the vertices around; 0 where none are."""
+def around(surface: Surface, places: Places, values: Float, known: Bool | Float) -> Float:
+    """(n, k) values (n, k) of the points that are known, or weights of theirs (n,), in the mean over the vertices around; 0 where none
+    are."""
     corners, count = surface.faces[places.face], len(surface.vertices)
     weight = places.barycentric * known[:, None]
     sums = [np.bincount(corners.ravel(), (weight * of[:, None]).ravel(), count) for of in (*values.T, np.ones(len(values)))]

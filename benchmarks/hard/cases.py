@@ -132,6 +132,8 @@ def _cameras() -> Iterator[tuple[str, Callable[[], Sample]]]:
     yield "pose-of-another-view", partial(damaged, damage.pose_of_another, 1)
     for px in (2, 8):
         yield f"principal-point-off-{px}-px", partial(damaged, damage.principal_point_off, px)
+    yield "lens-3-px", partial(damaged, damage.lens, 3)
+    yield "lens-3-px-undone", partial(damaged, damage.lens_given, 3)
 
 
 def _shapes() -> Iterator[tuple[str, Callable[[], Sample]]]:

@@ -11,10 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from mvps.camera import project
+from mvps.checks.lens import free_of_lens
 from mvps.scene import Bool, Camera, Capture, Float, View
 from mvps.synthetic.scene import WHITE, make_scene, photograph_scene
 from mvps.synthetic.settings import SceneSettings
@@ -243,3 +244,33 @@ def principal_point_off(capture: Capture, px: float, rng: np.random.Generator) -
     shift = np.zeros((3, 3))
     shift[:2, 2] = px * np.cos(angle), px * np.sin(angle)
     return each_view(capture, lambda view: replace(view, camera=replace(view.camera, K=view.camera.K + shift)))
+
+
+def lens_given(capture: Capture, px: float, rng: np.random.Generator) -> Capture:
+    """A calibration with a lens that bends the object's rim by this many pixels (k1 of lens.py), which photographs do not show."""
+
+    def change(view: View) -> View:
+        K = view.camera.K
+        rim = np.linalg.norm((view.pixels[:, ::-1] + 0.5 - K[:2, 2]) / K.diagonal()[:2], axis=1).max()
+        return replace(view, camera=replace(view.camera, distortion=(px / (view.camera.focal_length * rim**3), 0.0, 0.0, 0.0, 0.0)))
+
+    return each_view(capture, change)
+
+
+def lens(capture: Capture, px: float, rng: np.random.Generator) -> Capture:
+    """Such a calibration, and photographs and masks that show it."""
+
+    def change(view: View) -> View:
+        columns_and_rows = np.indices(view.mask.shape)[::-1].reshape(2, -1).T
+        free = free_of_lens(view.camera, columns_and_rows + 0.5)[:, ::-1] - 0.5
+
+        def at(image: Float) -> Float:
+            shown: Float = map_coordinates(image, free.T, order=1).reshape(view.mask.shape)
+            return shown
+
+        share, image = at(view.mask.astype(np.float64)), np.zeros((*view.mask.shape, len(view.lights), 3))
+        mask, image[view.mask] = share > 0.5, view.samples
+        values = [[at(image[..., k, c])[mask] / share[mask] for c in range(3)] for k in range(len(view.lights))]
+        return replace(view, mask=mask, samples=np.rint(np.moveaxis(np.array(values), -1, 0)).astype(np.uint16))
+
+    return each_view(lens_given(capture, px, rng), change)

@@ -32,8 +32,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from mvps.cores import on_cores
 from mvps.joint.observe import ViewSamples
-from mvps.scene import GRAZING_POWER, Law
-from mvps.shading import STEEPEST, gain, half_length, lobe
+from mvps.scene import Law
+from mvps.shading import GRAZING_POWER, STEEPEST, gain, half_length, lobe
 from solvers.low_rank import CAUCHY_95
 
 WORKERS = 2

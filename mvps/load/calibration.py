@@ -1,6 +1,7 @@
 """Calib_Results.mat and scene.json -> cameras.
 
-    Calib_Results.mat   KK (3, 3), or KK_i per view; Rc_i (3, 3), Tc_i (3, 1): camera_from_world of view i, OpenCV axes
+    Calib_Results.mat   KK (3, 3), or KK_i per view; Rc_i (3, 3), Tc_i (3, 1): camera_from_world of view i, OpenCV axes;
+                        optional kc (5, 1), or kc_i: distortion of the lens (checks/lens.py)
     scene.json          optional; "pixel_center": image coordinate c of the first pixel's centre (absent: 0)
 
 An image coordinate of the file plus (0.5 - c) is ours, whose first pixel's centre is at 0.5: so is the principal point.
@@ -28,21 +29,28 @@ CAMERA_BYTES = 9 * 8
 LARGEST = 1e10
 """Numbers of a calibration are smaller in any unit of length: squares of areas still fit single precision (1e38)."""
 
+LARGEST_OF_LENS = 1e4
+"""Of the distortion's: with k5, which counts most often, pixels a fifth of the focal length from the middle would move by half of that."""
+
+SHAPES = {"KK": ((3, 3),), "Rc": ((3, 3),), "Tc": ((3, 1), (1, 3)), "kc": ((5, 1), (1, 5), (4, 1), (1, 4))}
+"""By the first letters of a variable's name."""
+
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calib_Results.mat and scene.json. K, rotation, translation by view number; K in our pixel convention."""
+    """Calib_Results.mat and scene.json. K, rotation, translation, distortion by view number; K in our pixel convention."""
 
     path: Path
     K: Mapping[int, Float]
     rotation: Mapping[int, Float]
     translation: Mapping[int, Float]
+    distortion: Mapping[int, tuple[float, ...]]
     shared_K: bool
 
     def camera(self, number: int, height: int, width: int) -> Camera:
         """The camera of a view, height x width pixels; CaptureError where the numbers are none of a camera."""
         try:
-            return Camera(self.K[number], self.rotation[number], self.translation[number], height, width)
+            return Camera(self.K[number], self.rotation[number], self.translation[number], height, width, self.distortion[number])
         except ValueError as error:
             raise CaptureError(f"{self.path}, view {number}: {error}; export the calibration again") from None
 
@@ -60,9 +68,10 @@ def read_calibration(root: Path) -> Calibration:
         raise complaint(path, "Rc_1, Tc_1 and so on", f"only {few}", "export the extrinsics of every view")
     shared = not any(f"KK_{n}" in variables for n in numbers)
     K_names = {n: "KK" if shared else f"KK_{n}" for n in numbers}
-    names = {*K_names.values(), *(f"{kind}_{n}" for kind in ("Rc", "Tc") for n in numbers)}
+    lenses = {n: name for n in numbers if (name := f"kc_{n}" if f"kc_{n}" in variables else "kc") in variables}
+    names = {*K_names.values(), *lenses.values(), *(f"{kind}_{n}" for kind in ("Rc", "Tc") for n in numbers)}
     for name in sorted(names):
-        wanted = ((3, 1), (1, 3)) if name.startswith("Tc") else ((3, 3),)
+        wanted = SHAPES[name[:2]]
         if name not in variables:
             raise complaint(path, name, f"a file without it (it holds {len(variables)} variables)", "export the calibration of every view")
         if variables[name].shape not in wanted:
@@ -75,13 +84,14 @@ def read_calibration(root: Path) -> Calibration:
         {n: shift @ arrays[K_names[n]] for n in numbers},
         {n: arrays[f"Rc_{n}"] for n in numbers},
         {n: arrays[f"Tc_{n}"].reshape(3) for n in numbers},
+        {n: tuple(arrays[lenses[n]].ravel().tolist()) if n in lenses else () for n in numbers},
         shared,
     )
 
 
 def _numbers(path: Path, name: str, variable: Variable) -> Float:
     value = numbers_of(path, name, variable)
-    if value.dtype.kind not in "fiu" or not (np.abs(value) < LARGEST).all():
+    if value.dtype.kind not in "fiu" or not (np.abs(value) < (LARGEST_OF_LENS if name.startswith("kc") else LARGEST)).all():
         raise complaint(path, f"finite real numbers in {name}", f"{value.tolist()}", "export the calibration again")
     return value.astype(np.float64)
 

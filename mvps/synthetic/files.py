@@ -59,6 +59,8 @@ def _calibration(capture: Capture) -> bytes:
     for view in capture.views:
         i = int(view.name.rpartition("_")[2])
         values |= {f"KK_{i}": view.camera.K, f"Rc_{i}": view.camera.rotation, f"Tc_{i}": view.camera.translation[:, None]}
+        if view.camera.distortion:
+            values[f"kc_{i}"] = np.array(view.camera.distortion)[:, None]
     return _mat(values)
 
 

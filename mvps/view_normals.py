@@ -1,0 +1,108 @@
+"""Normals of a view's pixels, drawn towards the surface that all views made.
+
+A pixel has a normal p of its own, one photometric stereo (joint/pixels.py), and the normal m of the surface that it shows, which all views'
+normals, masks and smoothness made. Of the means p + a (m - p) the one nearest to the truth t has
+
+    a = E[(p - t) . (p - m)] / E|p - m|^2
+
+(James and Stein 1961; Stone 1974 for other data in the truth's place). The truth is not known, but other views' pixels err about it on
+their own: in its place stands the mean r of what the nearest views show there. Of each view's error, with the variance V, m holds a part
+of 1 / n where n views, effectively, show a place, n = (sum w)^2 / sum w^2. So (p - r) . (p - m) has V in the mean, where (p - t) . (p - m)
+has V (1 - 1 / n), and
+
+    a = (1 - 1 / n) E[(p - r) . (p - m)] / E|p - m|^2,      between 0 and 1
+
+with means over the vertices around. Where nothing but one view shows a place, p stays. What errs alike in all views, as lights do, shows in
+neither and stays as well.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.camera import project, view_directions
+from mvps.cores import on_cores
+from mvps.mesh import normalise
+from mvps.scene import Bool, Capture, Float, Surface, View
+from mvps.silhouette import sampled
+from mvps.texel_normals import Places, around
+from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster, visible_vertices
+
+OTHERS = 3
+"""Views beside a pixel's own that are asked: they show the same places, and with three r errs by little more than with all."""
+
+WHOLE = 0.99
+"""Of a bilinear value, the part that must come from pixels with normals."""
+
+Picture = NDArray[np.float32]
+
+
+class _Shown(NamedTuple):
+    """Of a view's n pixels: own (n, 3) normals, 0 where not known; surface's (n, 3), and its points (n, 3), 0 where it is missed; hits.
+    picture: the own ones with ones beside them (height, width, 4), 0 where not known. sees (V,): whether it sees a vertex."""
+
+    view: View
+    own: Float
+    mesh: Float
+    point: Float
+    hits: Hits
+    picture: Picture
+    sees: Bool
+
+
+def drawn_to_surface(capture: Capture, surface: Surface, pictures: list[Picture]) -> list[Picture]:
+    """The views' normals (height, width, 3), NaN where not known, each with its part of the surface's."""
+    caster = ray_caster(surface)
+    views = on_cores(lambda view, picture: _shown(caster, view, picture), capture.views, pictures)
+    towards = normalise(np.array([view.camera.centre for view in capture.views]) - surface.vertices.mean(0))
+    nearest = np.argsort(-(towards @ towards.T), axis=1, kind="stable")[:, 1 : 1 + OTHERS]
+    told = on_cores(lambda i: _products(surface, views[i], [views[j] for j in nearest[i]]), range(len(views)))
+    products, trust = (np.concatenate(parts) for parts in zip(*told, strict=True))
+    hits = [one.hits for one in views]
+    places = Places(np.concatenate([h.face for h in hits]).clip(0), np.concatenate([h.barycentric for h in hits]))
+    common, apart = around(surface, places, products, trust).T
+    weights = np.array([one.sees * _facing(one.view, caster.vertex_normals, surface.vertices) for one in views])
+    count = weights.sum(0) ** 2 / np.maximum((weights**2).sum(0), np.finfo(float).tiny)
+    alone = 1 / np.maximum(np.concatenate([interpolate(surface, h, count) for h in hits]), 1)
+    part = ((1 - alone) * common / np.maximum(apart, np.finfo(float).tiny)).clip(0, 1)
+    return on_cores(_drawn, views, pictures, np.split(part, np.cumsum([len(h.face) for h in hits])[:-1]))
+
+
+def _facing(view: View, normal: Float, points: Float) -> Float:
+    """(n,) squared cosines at which a view sees points with normals (n, 3)."""
+    cosine: Float = (normal * view_directions(view.camera, points)).sum(1).clip(0)
+    return cosine**2
+
+
+def _shown(caster: RayCaster, view: View, picture: Picture) -> _Shown:
+    surface, known = caster.surface, np.isfinite(picture).all(-1)
+    normals = np.zeros((*known.shape, 4), np.float32)
+    normals[known] = np.column_stack([picture[known], np.ones(known.sum())])
+    hits = camera_hits(caster, view.camera, view.pixels)
+    mesh, point = normalise(interpolate(surface, hits, caster.vertex_normals)), interpolate(surface, hits, surface.vertices)
+    own = normals[view.mask][:, :3].astype(float)
+    return _Shown(view, own, mesh, point, hits, normals, visible_vertices(caster, view.camera))
+
+
+def _products(surface: Surface, of: _Shown, others: list[_Shown]) -> tuple[Float, Float]:
+    """(n, 2) (p - r) . (p - m) and |p - m|^2 of a view's pixels, and (n,) their weight, 0 where no other view shows the place."""
+    corners, total = surface.faces[of.hits.face.clip(0)], np.zeros_like(of.own)
+    for other in others:
+        seen = np.flatnonzero((of.hits.face >= 0) & other.sees[corners].all(1))
+        found = sampled(other.picture, project(other.view.camera, of.point[seen])[0], cv2.BORDER_CONSTANT)
+        weight = (found[:, 3] > WHOLE) * _facing(other.view, of.mesh[seen], of.point[seen])
+        total[seen] += normalise(found[:, :3].astype(float)) * weight[:, None]
+    away, told = of.own - of.mesh, (total != 0).any(1) & (of.own != 0).any(1)
+    products = np.stack([((of.own - normalise(total)) * away).sum(1), (away**2).sum(1)], 1)
+    return products, told * _facing(of.view, of.mesh, of.point)
+
+
+def _drawn(of: _Shown, picture: Picture, part: Float) -> Picture:
+    result, normal = picture.copy(), normalise(of.own + part[:, None] * (of.mesh - of.own))
+    moved = (part > 0) & (of.own != 0).any(1)
+    result[of.view.mask] = np.where(moved[:, None], normal, picture[of.view.mask])
+    return result
