@@ -30,7 +30,7 @@ LARGEST = 1e10
 """Numbers of a calibration are smaller in any unit of length: squares of areas still fit single precision (1e38)."""
 
 LARGEST_OF_LENS = 1e4
-"""Of the distortion's: with k5, which counts most often, pixels a fifth of the focal length from the middle would move by half of that."""
+"""Of the distortion's: with such a k5 what lies a fifth of the focal length from the middle moves by two thirds of that, as no lens does."""
 
 SHAPES = {"KK": ((3, 3),), "Rc": ((3, 3),), "Tc": ((3, 1), (1, 3)), "kc": ((5, 1), (1, 5), (4, 1), (1, 4))}
 """By the first letters of a variable's name."""
