@@ -74,6 +74,15 @@ def test_principal_point_moves_to_our_pixel_centres(capture: Path, scene: str | 
     np.testing.assert_array_equal(read_capture(capture).views[0].camera.K, K + np.array([[0, 0, shift], [0, 0, shift], [0, 0, 0]]))
 
 
+def test_distortion_is_read_of_all_views_or_of_each(capture: Path) -> None:
+    assert [view.camera.distortion for view in read_capture(capture).views] == [(), ()]
+    of_all, of_second = [0.1, -0.2, 0.01, 0.02, 0.3], [0.4, 0.5, 0, 0]
+    scipy.io.savemat(capture / "Calib_Results.mat", calibration() | {"kc": np.array(of_all)[:, None], "kc_error": np.ones((5, 1))})
+    assert [view.camera.distortion for view in read_capture(capture).views] == [tuple(of_all)] * 2
+    scipy.io.savemat(capture / "Calib_Results.mat", calibration() | {"kc": np.array([of_all]), "kc_2": np.array([of_second])})
+    assert [view.camera.distortion for view in read_capture(capture).views] == [tuple(of_all), tuple(of_second)]
+
+
 def test_views_and_lights_are_picked_by_number(capture: Path) -> None:
     everything = read_capture(capture)
     one = read_capture(capture, views=[2], lights=[3, 1])

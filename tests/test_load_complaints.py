@@ -113,6 +113,13 @@ COMPLAINTS: list[tuple[Callable[[Path], None], dict[str, Any], list[str]]] = [
     (change_calibration(Rc_2=np.eye(2)), {}, ["wanted Rc_2 of shape (3, 3)"]),
     (change_calibration(Tc_1=NAN_TRANSLATION), {}, ["finite real numbers in Tc_1"]),
     (change_calibration(Tc_1=None), {}, ["wanted Tc_1"]),
+    (
+        change_calibration(kc=np.zeros((8, 1))),
+        {},
+        ["wanted kc of shape (5, 1), given shape (8, 1)", "remove it if photographs are undistorted"],
+    ),
+    (change_calibration(kc_2=np.full((5, 1), np.nan)), {}, ["finite real numbers in kc_2"]),
+    (change_calibration(kc=np.full((5, 1), 1e5)), {}, ["finite real numbers in kc"]),
     (change_calibration(Tc_1=np.zeros((4, 1))), {}, ["wanted Tc_1 of shape (3, 1), given shape (4, 1)"]),
     (change_calibration(Rc_2=None, Tc_2=None), {}, ["Rc_2 and Tc_2, because there is a folder view_02"]),
     (remove("view_02"), {}, ["a folder view_02, because Calib_Results.mat has Rc_2", "--views"]),

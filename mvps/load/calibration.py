@@ -30,7 +30,7 @@ LARGEST = 1e10
 """Numbers of a calibration are smaller in any unit of length: squares of areas still fit single precision (1e38)."""
 
 LARGEST_OF_LENS = 1e4
-"""Of the distortion's: with such a k5 what lies a fifth of the focal length from the middle moves by two thirds of that, as no lens does."""
+"""With such a k5 what lies a fifth of the focal length from the middle moves by two thirds of that, as no lens does."""
 
 SHAPES = {"KK": ((3, 3),), "Rc": ((3, 3),), "Tc": ((3, 1), (1, 3)), "kc": ((5, 1), (1, 5), (4, 1), (1, 4))}
 """By the first letters of a variable's name."""
@@ -75,7 +75,8 @@ def read_calibration(root: Path) -> Calibration:
         if name not in variables:
             raise complaint(path, name, f"a file without it (it holds {len(variables)} variables)", "export the calibration of every view")
         if variables[name].shape not in wanted:
-            raise complaint(path, f"{name} of shape {wanted[0]}", f"shape {variables[name].shape}", "export the calibration again")
+            what_to_try = "remove it if photographs are undistorted" if name.startswith("kc") else "export the calibration again"
+            raise complaint(path, f"{name} of shape {wanted[0]}", f"shape {variables[name].shape}", what_to_try)
     arrays = {name: _numbers(path, name, variables[name]) for name in sorted(names)}
     shift = np.eye(3)
     shift[:2, 2] = 0.5 - _pixel_centre(root / "scene.json")
@@ -91,8 +92,9 @@ def read_calibration(root: Path) -> Calibration:
 
 def _numbers(path: Path, name: str, variable: Variable) -> Float:
     value = numbers_of(path, name, variable)
-    if value.dtype.kind not in "fiu" or not (np.abs(value) < (LARGEST_OF_LENS if name.startswith("kc") else LARGEST)).all():
-        raise complaint(path, f"finite real numbers in {name}", f"{value.tolist()}", "export the calibration again")
+    largest = LARGEST_OF_LENS if name.startswith("kc") else LARGEST
+    if value.dtype.kind not in "fiu" or not (np.abs(value) < largest).all():
+        raise complaint(path, f"finite real numbers in {name}, below {largest:g}", f"{value.tolist()}", "export the calibration again")
     return value.astype(np.float64)
 
 
