@@ -152,7 +152,7 @@ def test_a_vessel_is_hollow() -> None:
     settings = SceneSettings(views=8, lights=6, size=80)
     scene, run = vessel(settings), Settings("cup")
     capture, _ = render_capture(settings, scene)
-    begun, plan = begin(capture, capture, run, scene.lights, Parts(), Progress()), carving_pass(False)
+    begun, plan = begin(capture, capture, run, scene.lights, Parts(), Progress()), carving_pass(False, True)
     bridged = stage_two("coarse refinement", capture, begun.surface, begun, plan, run, Progress())
     found, rounds = hollowed(capture, begun.grid, bridged, run, plan, Progress())
     top = scene.surface.vertices[:, 2].max()
