@@ -9,7 +9,7 @@ from mvps.coarse import rough_shape
 from mvps.material import LARGEST, Model
 from mvps.measures import distance_to
 from mvps.methods import BUDGETS, METHODS
-from mvps.plan import Parts, first_pass, last_pass
+from mvps.plan import Parts, carving_pass, first_pass, last_pass
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
 from mvps.scene import Capture, Reconstruction
@@ -62,3 +62,8 @@ def test_a_surface_that_is_far_off_is_pulled_by_photographs_first() -> None:
 
 def test_budgets_are_methods() -> None:
     assert set(BUDGETS) <= set(METHODS)
+
+
+def test_coarse_rounds_are_done_again_only_where_the_model_fits() -> None:
+    (fits,), (badly,) = (carving_pass(True, fits).rounds for fits in (True, False))
+    assert fits.carving and badly.carving and 0 < fits.still < fits.reach and np.isinf(badly.still)
