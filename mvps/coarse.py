@@ -135,9 +135,9 @@ def in_turn(
         if turn:
             surface = stage_one(field, refined.maps, CONTINUED, progress)
         refined = stage_two("coarse refinement", capture, surface, refined, of_turn, settings, progress, carried)
-        before, last = residual, refined.rounds[-1]
-        rounds, carried, residual = rounds + refined.rounds, refined.carried, last["residual"]
-        if (residual <= POOR_FIT and last["light_change_deg"] <= MOVING_DEG) or residual >= before:
+        before, turned = residual, max(one["light_change_deg"] for one in refined.rounds)
+        rounds, carried, residual = rounds + refined.rounds, refined.carried, refined.rounds[-1]["residual"]
+        if (residual <= POOR_FIT and turned <= MOVING_DEG) or residual >= before:
             break
     return refined, rounds
 
@@ -148,13 +148,15 @@ def hollowed(
     """Stage II with hollows dug that neither Stage I nor photographs reach (hollows.py), and the rounds that this took; as it was found
     where there are none, or where the model explains no more of the photographs with them.
 
-    Pits are dug one into the other while that helps; then Stage I goes on from their bottoms, whose normals it now has.
+    Pits are dug one into the other while that helps, each after a single round: what still moves is dug anew. Then Stage I goes on from
+    their bottoms, whose normals it now has.
     """
     from mvps.camera import pixel_footprint
     from mvps.device import chosen_device
     from mvps.hollows import beyond_noise, dug, hidden, solid
     from mvps.hull import visual_hull
     from mvps.occupancy import CONTINUED, Occupancy
+    from mvps.plan import once
     from mvps.verdict import INTERPOLATED, noise_share
 
     noise = INTERPOLATED * noise_share(capture)
@@ -177,7 +179,7 @@ def hollowed(
             trial, taken = best, []
             for _ in range(MOST_TURNS):
                 before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth))
-                trial = stage_two("hollows", capture, surface, before, of_turn, settings, progress)
+                trial = stage_two("hollows", capture, surface, before, once(of_turn), settings, progress)
                 taken += trial.rounds
                 if not (better(trial, before) and worth_digging(trial)):
                     break

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from mvps.joint.refine import RefineSettings, RoundSettings
 from mvps.material import LARGEST, Model
 from mvps.scene import Law
@@ -71,6 +73,11 @@ def carving_pass(free_lights: bool, fits: bool) -> RefineSettings:
     """What comes after Stage I: lights and normals on its surface, and hollows dug as deep as photographs tell, until vertices lie still
     where the model fits; where it does not, single photographs pull them elsewhere, and Stage I has a turn first."""
     return RefineSettings((replace(COARSE, still=STILL_PIXELS) if fits else COARSE,), free_lights=free_lights, half=True)
+
+
+def once(plan: RefineSettings) -> RefineSettings:
+    """The plan, its rounds done once each however far vertices still move."""
+    return replace(plan, rounds=tuple(replace(one, still=np.inf) for one in plan.rounds))
 
 
 def last_pass(preset: str, free_lights: bool, far: bool) -> RefineSettings:

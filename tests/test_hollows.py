@@ -123,14 +123,22 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
         return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), rounds=[{"number": float(next(counted))}])
 
     monkeypatch.setattr("mvps.coarse.stage_one", lambda *_: wide)
-    monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined())
+    repeated: dict[str, set[bool]] = {}
+
+    def stage_two(name: str, *given: Any) -> Any:
+        repeated.setdefault(name, set()).add(np.isfinite(given[3].rounds[0].still))
+        return refined()
+
+    monkeypatch.setattr("mvps.coarse.stage_two", stage_two)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
     monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
     monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
     monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
     found = refined()
-    best, rounds = hollowed(capture, None, found, Settings("somewhere"), None, None)  # type: ignore[arg-type]
+    best, rounds = hollowed(capture, None, found, Settings("somewhere"), carving_pass(True, True), None)  # type: ignore[arg-type]
     assert next(counted) - 2 == made and len(rounds) == kept
+    # Pits are dug on after a round each; where Stage I has been, vertices come to rest.
+    assert repeated in ({}, {"hollows": {False}, "coarse refinement": {True}})
     assert (best is found) == (kept == 0)
 
 
