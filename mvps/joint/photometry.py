@@ -29,7 +29,7 @@ from mvps.joint.patches import VERTICES_OF_PATCH, Patches, drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.reflectance import Observed, light_ratios
 from mvps.joint.steps import Anchor, confidence, free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
-from mvps.joint.thinned import thinned
+from mvps.joint.thinned import ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, Trial, choose, judged
 from mvps.memory import room_for
@@ -37,7 +37,7 @@ from mvps.mesh import angles_deg, edges, lengths, normalise, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
 LIGHT_VERTICES, TRIAL_VERTICES = 4000, 1000
-"""Vertices, in patches, that stand for all when lights are solved, and when components of the model are tried."""
+"""Vertices, in patches, that stand for all when lights are solved, and when components of the model are tried under enough photographs."""
 
 MATERIAL_STEPS, CARRIED_STEPS = 3, 2
 LIGHT_STEPS = 3
@@ -151,7 +151,9 @@ def _errors(
     state: State, capture: Capture, few: list[ViewSamples], start: Vertices, anchor: Anchor, patches: Patches
 ) -> Callable[[Model], tuple[Float, Float]]:
     """The errors on held-out samples, lit and in shadow, under a model, of the vertices of the first patches."""
-    patches = patches.first(TRIAL_VERTICES // VERTICES_OF_PATCH)
+    # Of few photographs more vertices: a component stays by how many samples speak for it, not by luck of those drawn.
+    more = max(1.0, ENOUGH_PHOTOGRAPHS / sum(samples.image.shape[1] for samples in few))
+    patches = patches.first(int(more * TRIAL_VERTICES) // VERTICES_OF_PATCH)
     few, part, tie = subset(few, start, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
     return partial(held_out_errors, few, part, grey_lights(state.lights, patches.vertex.device), tie, patches, rotations, state.law)
