@@ -84,13 +84,9 @@ def last_pass(preset: str, free_lights: bool, far: bool) -> RefineSettings:
     """Rounds after Stage I; sweeps reach as far as Stage I may be off. far: photographs have farther to pull the surface, because Stage I
     saw them at half their size, or had nothing but vertices' normals to go by, of views with fewer lights than tell a normal."""
     first = RoundSettings(2.0, 1.2, 0.3, crease=0.1)
-    rounds = {
+    rounds: tuple[RoundSettings, ...] = {
         "standard": (first, replace(first, for_detail=True)),
-        "fine": (
-            RoundSettings(1.5, 1.2, 0.3),
-            RoundSettings(0.8, 1.2, 0.3, crease=0.2),
-            RoundSettings(0.8, 0.6, 0.2, crease=0.1),
-        ),
+        "fine": (first, replace(first, edge=1.0)),
     }[preset]
     if far:
         rounds = (replace(COARSE, still=STILL_PIXELS), *rounds)
