@@ -81,6 +81,10 @@ def _joined(argv: Sequence[str]) -> list[str]:
     return joined
 
 
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Requests to end."""
+
+
 class _Ended(KeyboardInterrupt):
     """By a signal whose number is its first argument: nothing half-written stays."""
 
@@ -89,7 +93,7 @@ class _Ended(KeyboardInterrupt):
 def _signals() -> Iterator[None]:
     """While a command runs, a request to end is an exception. Where a caller has his own way with a signal, that stays."""
     mine = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    before = {number: signal.getsignal(number) for number in ENDING}
     asked = [number for number, way in before.items() if mine and way in (signal.SIG_DFL, signal.default_int_handler)]
     came: list[int] = []
 
@@ -109,6 +113,24 @@ def _signals() -> Iterator[None]:
     finally:
         for number in asked:
             signal.signal(number, before[number])
+
+
+@contextmanager
+def not_ended() -> Iterator[None]:
+    """Requests to end wait for the end of the block, where they are answered as they would have been: what it starts has an owner then, who
+    can end it too."""
+    mine = threading.current_thread() is threading.main_thread()
+    before = {number: way for number in ENDING if mine and callable(way := signal.getsignal(number))}
+    came: list[int] = []
+    for number in before:
+        signal.signal(number, lambda number, _: came.append(number))
+    try:
+        yield
+    finally:
+        for number, way in before.items():
+            signal.signal(number, way)
+    if came:
+        signal.raise_signal(came[0])
 
 
 def run(main: Callable[[Sequence[str]], None], argv: Sequence[str] | None = None) -> int:

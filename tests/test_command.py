@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mvps.command import lights_argument, number_list, parse, parser, run
+from mvps.command import lights_argument, not_ended, number_list, parse, parser, run
 from mvps.scene import CaptureError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -71,6 +72,14 @@ def test_a_closed_pipe_is_quiet() -> None:
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait(timeout=30) == 141
+
+
+def test_a_request_to_end_waits_for_what_is_being_started() -> None:
+    made = []
+    with pytest.raises(KeyboardInterrupt), not_ended():
+        signal.raise_signal(signal.SIGINT)
+        made.append("owned")
+    assert made and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_bad_options_read_like_bad_input(capsys: pytest.CaptureFixture[str]) -> None:

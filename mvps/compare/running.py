@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mvps.command import not_ended
 from mvps.evaluate import evaluate_result, write_json
 from mvps.inputs import DAMAGED, JSON_LIMIT, parsed_json, read_file, shown
 from mvps.load import read_truth
@@ -91,13 +92,16 @@ def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
     command = [sys.executable, "-m", "mvps.methods", str(capture), "--method", name, "--out", str(folder), *options]
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+", encoding="utf-8") as complaints:
-        process = subprocess.Popen(command, stderr=complaints)
+        process = None
         try:
+            with not_ended():
+                process = subprocess.Popen(command, stderr=complaints)
             _, status, usage = os.wait4(process.pid, 0)
         except BaseException:
             # Whoever ends the comparison wants nothing of it to go on.
-            process.terminate()
-            process.wait()
+            if process is not None:
+                process.terminate()
+                process.wait()
             raise
         seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
         busy = usage.ru_utime + usage.ru_stime
