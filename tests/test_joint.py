@@ -19,13 +19,15 @@ from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, vertex_equations
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import SHADOW_MARGIN, ViewSamples, observe
-from mvps.joint.photometry import grey_lights, of_one_normal
+from mvps.joint.patches import drawn_patches
+from mvps.joint.photometry import LIGHT_VERTICES, TRIAL_VERTICES, State, _errors, grey_lights, of_one_normal
 from mvps.joint.pixels import _beside, all_pixel_normals, filled
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import stated_confidence
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import fuse
+from mvps.material import Model
 from mvps.mesh import face_normals, isotropic_remesh, normalise, vertex_normals
 from mvps.scene import Capture, Law, Lights, Material, NormalMap, Surface
 
@@ -351,3 +353,17 @@ def test_thinned_views_keep_other_lights_and_their_own_light(scene: SphereScene)
     half = thinned(crowd, Lights((direction,) * 21, (numbered,) * 21, True), fewer=2)[0]
     assert ENOUGH_LIGHTS / 2 <= min(len(v.lights) for v in half.views) <= min(sizes) / 2
     assert {number for v in half.views for number in v.lights} == set(many.lights)
+
+
+@pytest.mark.parametrize("fewer", [1.0, 2.0, 100.0])
+def test_of_few_photographs_more_vertices_try_the_models_components(
+    scene: SphereScene, fewer: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, start, _, law = problem(scene)
+    photographs, surface = sum(samples.image.shape[1] for samples in views), scene.reconstruction.surface
+    monkeypatch.setattr("mvps.joint.photometry.ENOUGH_PHOTOGRAPHS", fewer * photographs)
+    seen = torch.cat([samples.vertex for samples in views]).unique().numpy()
+    patches = drawn_patches(seen, surface, start.normal.numpy(), LIGHT_VERTICES, np.random.default_rng(0), CPU)
+    state = State(surface, scene.reconstruction.lights, (), law, Model())
+    lit, _ = _errors(state, scene.capture, views, start, free_reflectance(start.normal, 1.0, 2), patches)(Model())
+    assert len(lit) == pytest.approx(min(fewer * TRIAL_VERTICES, len(patches.vertex)), rel=0.1)
