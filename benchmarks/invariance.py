@@ -2,8 +2,8 @@
 
     python benchmarks/invariance.py CAPTURES [NAME ...] [--preset standard]
 
-double     all that is computed in single precision is computed in double, but for the ray tracer and OpenCV's pictures of distances,
-           which have single precision alone
+double     all that is computed in single precision is computed in double, from the same random draws, but for the ray tracer and OpenCV's
+           pictures of distances, which have single precision alone
 one core   the process may use one core
 seed N     of all random draws
 units x 10 translations of the cameras and the true mesh ten times as large
@@ -46,7 +46,7 @@ import sys
 import numpy, torch
 import embreex.rtcore_scene, cv2, scipy.ndimage, igl, nlopt
 from skimage.measure import _marching_cubes_lewiner as cubes, _marching_cubes_lewiner_cy as compiled
-single, remap = numpy.float32, cv2.remap
+single, remap, drawn = numpy.float32, cv2.remap, torch.float32
 class Kept:
     def __getattr__(self, name):
         return single if name == "float32" else getattr(numpy, name)
@@ -56,6 +56,9 @@ numpy.float32 = numpy.float64
 torch.float32 = torch.float64
 torch.Tensor.float = torch.Tensor.double
 torch.set_default_dtype(torch.float64)
+def same(draw):
+    return lambda *size, **named: draw(*size, **named, dtype=drawn).double()
+torch.rand, torch.randn = same(torch.rand), same(torch.randn)
 import mvps.visibility
 mvps.visibility.np = Kept()
 from mvps.reconstruct import main

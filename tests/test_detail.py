@@ -12,7 +12,6 @@ from test_agreement import true_maps
 
 from mvps.joint.detail import Detailed, detailed, interpolated
 from mvps.joint.observe import visible_in
-from mvps.joint.refine import shaded_as
 from mvps.joint.vertices import Moved
 from mvps.measures.ours import mesh_normal_errors, surface_errors
 from mvps.mesh import face_areas, isotropic_remesh, nearest, normalise, unbiased, vertex_normals
@@ -88,14 +87,3 @@ def test_a_split_ball_is_neither_larger_nor_smaller() -> None:
         np.average(np.linalg.norm(s.vertices[s.faces].mean(1), axis=1) - RADIUS, weights=face_areas(s)) for s in (given.surface, found)
     )
     assert abs(after) < min(abs(before), 0.01)
-
-
-def test_shading_normals_lie_between_the_vertices_and_the_surface_s() -> None:
-    """Where the two are opposite, the surface's stay."""
-    made = make_sphere(3).reconstruction
-    normal, own = made.material.normal.copy(), vertex_normals(made.surface)
-    normal[5] = -own[5]
-    found = shaded_as(replace(made.material, normal=normal), made.surface).normal
-    rest = np.arange(len(own)) != 5
-    np.testing.assert_allclose((found * own).sum(1)[rest], (found * normal).sum(1)[rest], atol=1e-9)
-    assert (found[5] == own[5]).all() and ((found * own).sum(1)[rest] >= (normal * own).sum(1)[rest] - 1e-12).all()

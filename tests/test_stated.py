@@ -14,7 +14,7 @@ from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.photometry import grey_lights
 from mvps.joint.reflectance import Observed
-from mvps.joint.stated import icosahedron, stated_confidence
+from mvps.joint.stated import icosahedron, stated_errors
 from mvps.joint.steps import free_reflectance, vertex_steps
 from mvps.mesh import vertex_normals
 from mvps.scene import RELIABLE, Float, Law, Surface
@@ -46,7 +46,7 @@ def stated_deg(
     """Stated standard deviations, degrees, infinite where nothing is known."""
     observed = Observed(scene.capture, scene.reconstruction.surface, views, vertices, lights, LAMBERT)
     with np.errstate(divide="ignore"):
-        return np.degrees(RELIABLE * np.sqrt(1 / stated_confidence(observed, 0.3, finer) - 1))
+        return np.degrees(RELIABLE * np.sqrt(1 / stated_errors(observed, 0.3, finer).confidence - 1))
 
 
 def solved(views: list[ViewSamples], truth: Vertices, lights: list[DirectionalLights]) -> Vertices:

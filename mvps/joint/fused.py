@@ -10,30 +10,21 @@ it gives the mean's standard deviation
 since what is wrong with the lights is wrong in all views, and since where views differ by more there is nothing better: positions come
 from the same views.
 
-Blur. A pixel's normal is a mean over its area, of variance 1/12 along either axis, and between pixels normals are interpolated linearly,
-which adds 1/6. On a surface seen at an angle a the footprint is longer by 1 / cos a along one of two directions, so that with p the
-footprint of a pixel and weights as above a normal is a mean over the variance
-
-    b = (1/12 + 1/6) sum w p^2 (1 + 1 / cos^2 a) / 2 / sum w
-
-Edges come out round. With S the mean over the faces around, whose kernel has the variance v, n - S n is -v/2 times n's Laplacian, and
-
-    n + SHARPENING part (b / v) (n - S n),        part = 1 - variance / n / D^2, at least 0
-
-gives back what blur took where faces next to each other differ by more, |n - S n|^2 / 2 = D^2 in the mean over the same faces, than errors
-alone make them (Wiener 1949).
+What pixels blur is given back (sharpened.py).
 """
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from mvps.camera import bilinear, footprint, project, view_directions
+from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.joint.pixels import few_lights
+from mvps.joint.sharpened import pixel_blur, sharpened
 from mvps.mesh import face_normals, lengths, normalise
 from mvps.scene import Bool, Capture, Float, Int, NormalMap, Surface
 from mvps.silhouette import sampled
@@ -53,25 +44,6 @@ LEAST_VIEWS = 1.5
 
 ROUNDS = 2
 """Of averaging variances with the faces around."""
-
-
-PIXEL_BLUR = 1 / 12 + 1 / 6
-"""Variance along an axis of a pixel and of linear interpolation between pixels, pixels^2."""
-
-
-SHARPENING = 2.0
-"""Over the first order of undoing a pixel's blur: views lie on each other with errors of some tenths of a pixel, which blurs what they say
-together once more. Chosen among 1, 2 and 3 (docs/method.md)."""
-
-MOST_GAIN = 8.0
-"""Of the difference: what faces of a third of a pixel take. A face with hardly any area around would take any."""
-
-LEAST_TURN = 1e-4
-"""Between neighbouring faces, radians: less is no bend that could be blunted."""
-
-LEAST_COSINE = 0.5
-"""Of the angle at which a face is seen, in its blur: beyond 60 degrees a view has little weight, and is the best one only where too
-little is known to sharpen."""
 
 
 class FaceNormals(NamedTuple):
@@ -115,9 +87,10 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
         points = centre[chosen]
         cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, points)).clip(0)
         found = sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
-        along = footprint(view.camera, points) ** 2 * (1 + 1 / np.maximum(cosine, LEAST_COSINE) ** 2) / 2
         # Between pixels of a bent surface the mean is shorter, which is no scatter of views.
-        return chosen, np.column_stack([normalise(found[:, :3]) * found[:, 3:], found[:, 3], along * found[:, 3]])
+        return chosen, np.column_stack(
+            [normalise(found[:, :3]) * found[:, 3:], found[:, 3], pixel_blur(view.camera, points, cosine) * found[:, 3]]
+        )
 
     for chosen, summed in on_cores(of_view, range(len(capture.views))):
         total[chosen] += summed[:, :3]
@@ -133,21 +106,9 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
     error = _around(scatter * count / np.maximum(count - 1, LEAST_VIEWS - 1), known, surface) / np.maximum(count, 1)
     # Of few lights the maps hold the mesh's own normals (pixels.py), about which views are of one mind.
     sigma = np.inf if few_lights(capture) else np.sqrt(error + SHARED_SIGMA**2)
-    blur *= PIXEL_BLUR / np.maximum(weights, LEAST_WEIGHT)
-    return FaceNormals(_sharpened(target, blur, error, known, surface), np.broadcast_to(np.fmin(sigma, NORMAL_SIGMA), len(faces)))
-
-
-def _sharpened(normal: Float, blur: Float, error: Float, known: Bool, surface: Surface) -> Float:
-    """Normals (F, 3), unit, without their blur (F,); error (F,) of theirs along a tangent, NaN where not known."""
-    # About the middle: squares of places far from it would swallow what faces lie apart.
-    centre = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0)
-    near = _mean_around(np.column_stack([normal, centre, (centre**2).sum(1)]), surface)
-    spread = (near[:, 6] - 2 * (near[:, 3:6] * centre).sum(1) + (centre**2).sum(1)) / 2
-    away = normal - near[:, :3]
-    apart = _around((away**2).sum(1) / 2, known, surface)
-    part = np.nan_to_num(1 - error / np.maximum(apart, LEAST_TURN**2)).clip(0)
-    gain = SHARPENING * part * blur / np.maximum(spread, np.finfo(float).tiny)
-    return normalise(normal + gain.clip(max=MOST_GAIN)[:, None] * away)
+    blur /= np.maximum(weights, LEAST_WEIGHT)
+    sharp = sharpened(target, centre, blur, error, partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface))
+    return FaceNormals(sharp, np.broadcast_to(np.fmin(sigma, NORMAL_SIGMA), len(faces)))
 
 
 def _mean_around(values: Float, surface: Surface) -> Float:

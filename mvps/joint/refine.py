@@ -19,7 +19,7 @@ from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
-from mvps.joint.detail import detailed, directions, interpolated
+from mvps.joint.detail import detailed, interpolated
 from mvps.joint.fused import face_targets
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
@@ -38,7 +38,8 @@ from mvps.joint.photometry import (
 )
 from mvps.joint.pixels import few_lights
 from mvps.joint.reflectance import Observed
-from mvps.joint.stated import stated_confidence
+from mvps.joint.shown import own_normals, shaded_as
+from mvps.joint.stated import stated_errors
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
@@ -249,15 +250,9 @@ def refine(
     return replace(result, material=shaded_as(result.material, result.surface)) if settings.final else result
 
 
-def shaded_as(material: Material, surface: Surface) -> Material:
-    """The material with normals halfway to those of its surface: a vertex's come from all lights at the vertex, the surface's from what
-    pixels around show and views agree on, sharpened; they err about as much, and not alike."""
-    return replace(material, normal=directions((material.normal + vertex_normals(surface)) / 2, surface))
-
-
 def _coloured(state: State, settings: RefineSettings, generator: np.random.Generator) -> Material:
-    """The material with albedo and lobes in the photographs' colours, a neural residual, if allowed, where that helps, and the stated
-    error."""
+    """The material with albedo and lobes in the photographs' colours, a neural residual, if allowed, where that helps, the stated error,
+    and normals without pixels' blur."""
     observed, lights = _observed(state)
     ratios = [channel_ratio(e) for e in lights.intensity]
     coloured_lobes = False
@@ -269,8 +264,9 @@ def _coloured(state: State, settings: RefineSettings, generator: np.random.Gener
     if settings.model.neural:
         trial, residual = neural_residual(observed, relative_residuals(observed.views, observed.vertices), POOR_FIT, generator)
         state.trials.append(trial)
-    certain = np.where(np.isfinite(albedo).all(1), stated_confidence(observed, WEAK_TIE, settings.detail), 0)
-    material = replace(material_of(state, albedo), confidence=certain, residual=residual)
+    stated, material = stated_errors(observed, WEAK_TIE, settings.detail), material_of(state, albedo)
+    certain = np.where(np.isfinite(albedo).all(1), stated.confidence, 0)
+    material = replace(material, normal=own_normals(material.normal, stated.noise, observed), confidence=certain, residual=residual)
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 
 

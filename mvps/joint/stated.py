@@ -25,6 +25,8 @@ No constant is fitted to true normals; that noise stays in both sums, and the la
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -49,9 +51,17 @@ def icosahedron() -> Float:
     return normalise(corners)
 
 
-def stated_confidence(of: Observed, tie: float, finer: bool = False) -> Float:
-    """(V,) confidence (scene.py) in the vertices' normals as those of the surface; 0 without samples. tie: radians. finer: the result's
-    mesh has what photographs show below these edges (detail.py), so that nothing is added for it."""
+class Stated(NamedTuple):
+    """confidence (V,) in the vertices' normals as those of the surface (scene.py), 0 without samples; noise (V,) what noise of the samples
+    alone makes of their variance along a tangent, radians^2, NaN without samples."""
+
+    confidence: Float
+    noise: Float
+
+
+def stated_errors(of: Observed, tie: float, finer: bool = False) -> Stated:
+    """How well the vertices' normals are known. tie: radians. finer: the result's mesh has what photographs show below these edges
+    (detail.py), so that nothing is added for it."""
     hands = min(WORKERS, len(of.views))
     parts = on_cores(lambda k: _sums(of.views[k::hands], of.vertices, of.lights[k::hands], of.law), range(hands))
     hessian, meat, of_kinds, squares, count = (sum(of_hands[1:], of_hands[0]) for of_hands in zip(*parts, strict=True))
@@ -71,7 +81,8 @@ def stated_confidence(of: Observed, tie: float, finer: bool = False) -> Float:
     edge = edge.clamp_min(0)
     detail = 0.0 if finer else edge * (edge / coarse.clamp_min(1e-12)).clamp_max(1)
     sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail).sqrt()
-    return torch.where(seen, confidence_of(sigma), 0.0).double().cpu().numpy()
+    confidence, noise = torch.where(seen, confidence_of(sigma), 0.0), torch.where(seen, noise, torch.nan)
+    return Stated(confidence.double().cpu().numpy(), noise.double().cpu().numpy())
 
 
 def _bands(normal: Tensor, seen: Tensor, noise: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,67 @@
+"""Normals without the blur of the pixels that they come from: of faces (fused.py), of vertices (shown.py).
+
+Blur. A pixel's normal is a mean over its area, of variance 1/12 along either axis, and between pixels normals are interpolated linearly,
+which adds 1/6. On a surface seen at an angle a the footprint is longer by 1 / cos a along one of two directions, so that with p the
+footprint of a pixel and w the weights of the views a normal is a mean over the variance
+
+    b = (1/12 + 1/6) sum w p^2 (1 + 1 / cos^2 a) / 2 / sum w
+
+Edges come out round. With S the mean over what lies around, whose kernel has the variance v, n - S n is -v/2 times n's Laplacian, and
+
+    n + SHARPENING part (b / v) (n - S n),        part = 1 - e / D^2, at least 0
+
+gives back what blur took where normals next to each other differ by more, |n - S n|^2 / 2 = D^2 in the mean over some twenty of them, than
+their errors' variance e along a tangent makes them (Wiener 1949).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mvps.camera import footprint
+from mvps.mesh import normalise
+from mvps.scene import Camera, Float
+
+PIXEL_BLUR = 1 / 12 + 1 / 6
+"""Variance along an axis of a pixel and of linear interpolation between pixels, pixels^2."""
+
+SHARPENING = 2.0
+"""Over the first order of undoing a pixel's blur: views lie on each other with errors of some tenths of a pixel, which blurs what they say
+together once more. Chosen among 1, 2 and 3 (docs/method.md)."""
+
+MOST_GAIN = 8.0
+"""Of the difference: what faces of a third of a pixel take. A face with hardly any area around would take any."""
+
+LEAST_TURN = 1e-4
+"""Between neighbours, radians: less is no bend that could be blunted."""
+
+LEAST_COSINE = 0.5
+"""Of the angle at which a place is seen, in its blur: beyond 60 degrees a view has little weight, and is the best one only where too
+little is known to sharpen."""
+
+
+def pixel_blur(camera: Camera, points: Float, cosine: Float) -> Float:
+    """(n,) variance along the surface over which a view's pixels average at points (n, 3) seen under angles with cosines (n,), length^2."""
+    blur: Float = PIXEL_BLUR * footprint(camera, points) ** 2 * (1 + 1 / np.maximum(cosine, LEAST_COSINE) ** 2) / 2
+    return blur
+
+
+def sharpened(
+    normal: Float, place: Float, blur: Float, error: Float, around: Callable[[Float], Float], over_some: Callable[[Float], Float]
+) -> Float:
+    """Normals (n, 3), unit, at place (n, 3), without their blur (n,).
+
+    error (n,): their variance along a tangent, NaN where not known; around: S, of values (n, k); over_some: means over some twenty of n
+    values, NaN where none is known.
+    """
+    # About the middle: squares of places far from it would swallow what neighbours lie apart.
+    centre = place - place.mean(0)
+    near = around(np.column_stack([normal, centre, (centre**2).sum(1)]))
+    spread = (near[:, 6] - 2 * (near[:, 3:6] * centre).sum(1) + (centre**2).sum(1)) / 2
+    away = normal - near[:, :3]
+    apart = over_some((away**2).sum(1) / 2)
+    part = np.nan_to_num(1 - error / np.maximum(apart, LEAST_TURN**2)).clip(0)
+    gain = SHARPENING * part * blur / np.maximum(spread, np.finfo(float).tiny)
+    return normalise(normal + gain.clip(max=MOST_GAIN)[:, None] * away)
