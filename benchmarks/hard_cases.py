@@ -27,7 +27,7 @@ from typing import Any
 import cv2
 import numpy as np
 from accuracy import COLUMNS, HERE, machine, ran, table
-from hard.cases import CASES, Sample, by_chance
+from hard.cases import CASES, OF_THE_MADE_OBJECT, Sample, by_chance
 from hard.damage import background
 from hard.scenes import BASE
 
@@ -144,7 +144,8 @@ def page(record: dict[str, Any]) -> str:
     bounds = f"mesh normals are more than {BAD_DEG:g} deg or the surface (Chamfer) more than {BAD_PX:g} px off in the mean"
     parts += ["## Is the status honest?", f"A result is bad where {bounds}.", "### The cases above", honesty(rows)]
     if random:
-        text = f"`{command} --honesty {len(random)}`: made objects under random settings with one or two random defects."
+        of = f"the made object, from case {OF_THE_MADE_OBJECT} on lumps by chance"
+        text = f"`{command} --honesty {len(random)}`: {of}, under random settings with one or two random defects."
         parts += [f"### {len(random)} cases by chance", text, honesty(random)]
     return "\n\n".join(parts) + "\n"
 

@@ -273,9 +273,11 @@ def test_every_case_has_a_group_and_a_file_name() -> None:
     assert all(name == Path(name).name and " " not in name for name in cases.CASES)
 
 
-def test_a_case_by_chance_is_the_same_again_and_its_truth_is_unharmed() -> None:
-    sample, what = cases.by_chance(4)
-    again, same = cases.by_chance(4)
+@pytest.mark.parametrize("number", [4, 51])
+def test_a_case_by_chance_is_the_same_again_and_its_truth_is_unharmed(number: int) -> None:
+    sample, what = cases.by_chance(number)
+    again, same = cases.by_chance(number)
+    assert ("lumps" in what) == (number >= cases.OF_THE_MADE_OBJECT)
     assert what == same and not changed_views(sample.given, again.given)
     assert changed_views(sample.given, sample.good)
     assert tuple(view.name for view in sample.good.views) == sample.truth.views

@@ -14,6 +14,7 @@ import numpy as np
 
 from hard import damage, scenes
 from hard.damage import Damage
+from hard.lumps import lumps
 from hard.scenes import BASE, Change, rendered
 from mvps.scene import Capture, Surface, Truth
 from mvps.synthetic.scene import Photograph
@@ -192,6 +193,10 @@ DEFECTS: dict[str, tuple[Damage, float, float]] = {
 """What cases by chance suffer, and between which amounts, evenly in the logarithm."""
 
 
+OF_THE_MADE_OBJECT = 50
+"""Cases by chance that show the made object; those after them show lumps, each others."""
+
+
 def by_chance(number: int) -> tuple[Sample, str]:
     """A scene by chance with one or two defects, and what it is, in words. The same number gives the same case."""
     rng = np.random.default_rng((number, 7))
@@ -205,8 +210,10 @@ def by_chance(number: int) -> tuple[Sample, str]:
         exposure=float(rng.uniform(0.93, 0.9995)),
         seed=number,
     )
-    good, truth = rendered(settings)
-    given, words = good, [f"{settings.views} views x {settings.lights} lights{', free' * settings.free_lights}, noise {settings.noise:.3f}"]
+    other = number >= OF_THE_MADE_OBJECT
+    good, truth = rendered(settings, (lambda _: scenes.shaped_as(lumps(number), settings)) if other else None)
+    of_lights = f"{settings.lights} lights{', free' * settings.free_lights}, noise {settings.noise:.3f}"
+    given, words = good, [f"{'lumps, ' * other}{settings.views} views x {of_lights}"]
     for name in rng.choice(list(DEFECTS), size=rng.integers(1, 3), replace=False):
         by, least, most = DEFECTS[name]
         amount = float(np.exp(rng.uniform(np.log(least), np.log(most))))
