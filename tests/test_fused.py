@@ -77,7 +77,7 @@ def sheet(z: np.ndarray) -> tuple[Surface, np.ndarray, np.ndarray]:
 
 def without_blur(normal: np.ndarray, blur: np.ndarray, error: np.ndarray, surface: Surface) -> np.ndarray:
     """As of faces."""
-    place, known = surface.vertices[surface.faces].mean(1), np.ones(len(normal), bool)
+    place, known = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0), np.ones(len(normal), bool)
     around, over_some = partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface)
     return sharpened(normal, place, blur, error, around, over_some)
 

@@ -105,28 +105,3 @@ def test_held_steps_keep_the_mean_slope_and_turn_the_rest() -> None:
     # The change is H^-1 A^T m with one m for all vertices of a patch.
     force = (hessian.double() / vertices.scale.double()[:, None, None] ** 2 @ (step - after)[..., None].double())[..., 0]
     assert force[:, 2:].abs().max() < 1e-2 * force[:, :2].abs().max()
-
-
-def places(vertices: np.ndarray, seed: int) -> np.ndarray:
-    """(20, 3) middles of patches on the upper half of a ball, in order."""
-    ball_of = trimesh.creation.icosphere(subdivisions=4, radius=30)
-    surface = Surface(vertices, np.array(ball_of.faces))
-    patches = drawn_patches(np.flatnonzero(vertices[:, 2] > 0), surface, vertex_normals(surface), 500, np.random.default_rng(seed), CPU)
-    sums = patches.summed(torch.tensor(vertices[patches.vertex.numpy()]))
-    return (sums / VERTICES_OF_PATCH).numpy()
-
-
-def test_patches_lie_where_they_lie_on_another_mesh_of_the_object() -> None:
-    """On one whose vertices are elsewhere, by some hundredths of an edge; another seed draws
-    other places."""
-    ball_of = trimesh.creation.icosphere(subdivisions=4, radius=30)
-    vertices, edge = np.array(ball_of.vertices), ball_of.edges_unique_length.mean()
-    here = places(vertices, 0)
-    moved = normalise(vertices + 0.03 * edge * np.random.default_rng(0).normal(size=vertices.shape)) * 30
-
-    def apart(there: np.ndarray) -> float:
-        """Median distance to the nearest middle of the others, edges."""
-        return float(np.median(np.linalg.norm(here[:, None] - there, axis=2).min(1)) / edge)
-
-    assert apart(places(moved, 0)) < 1
-    assert apart(places(vertices, 1)) > 2

@@ -24,7 +24,7 @@ import numpy as np
 from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.joint.pixels import few_lights
-from mvps.joint.sharpened import pixel_blur, sharpened
+from mvps.joint.sharpened import PIXEL_BLUR, pixel_area, sharpened
 from mvps.mesh import face_normals, lengths, normalise
 from mvps.scene import Bool, Capture, Float, Int, NormalMap, Surface
 from mvps.silhouette import sampled
@@ -87,10 +87,9 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
         points = centre[chosen]
         cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, points)).clip(0)
         found = sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
+        area = pixel_area(view.camera, points, cosine)
         # Between pixels of a bent surface the mean is shorter, which is no scatter of views.
-        return chosen, np.column_stack(
-            [normalise(found[:, :3]) * found[:, 3:], found[:, 3], pixel_blur(view.camera, points, cosine) * found[:, 3]]
-        )
+        return chosen, np.column_stack([normalise(found[:, :3]) * found[:, 3:], found[:, 3], area * found[:, 3]])
 
     for chosen, summed in on_cores(of_view, range(len(capture.views))):
         total[chosen] += summed[:, :3]
@@ -106,8 +105,9 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
     error = _around(scatter * count / np.maximum(count - 1, LEAST_VIEWS - 1), known, surface) / np.maximum(count, 1)
     # Of few lights the maps hold the mesh's own normals (pixels.py), about which views are of one mind.
     sigma = np.inf if few_lights(capture) else np.sqrt(error + SHARED_SIGMA**2)
-    blur /= np.maximum(weights, LEAST_WEIGHT)
-    sharp = sharpened(target, centre, blur, error, partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface))
+    blur *= PIXEL_BLUR / np.maximum(weights, LEAST_WEIGHT)
+    around, over_some = partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface)
+    sharp = sharpened(target, centre - surface.vertices.mean(0), blur, error, around, over_some)
     return FaceNormals(sharp, np.broadcast_to(np.fmin(sigma, NORMAL_SIGMA), len(faces)))
 
 

@@ -17,7 +17,6 @@ multipliers to each patch. With A_j = a_j J_j, c = sum_j a_j (s_j - s0_j) and E 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -80,32 +79,11 @@ def _slopes(normal: Tensor, plane: Tensor, basis: Tensor) -> tuple[Tensor, Tenso
     return slope, (basis - slope[..., None] * plane[:, None]) / height[..., None]
 
 
-def _scattered(points: Float, generator: np.random.Generator) -> Int:
-    """The numbers of points (n, 3) in random order: first one of each of their box's cells, about as large as a patch and the nearest to
-    its middle, then the others; a cell comes early as often as it has points (Efraimidis and Spirakis 2006).
-
-    Places are drawn, not numbers, so that a mesh that hardly differs from another has hardly other patches: otherwise lights differ by as
-    much as between two draws of all, 0.03 deg (docs/method.md).
-    """
-    # A power of two: a point more or less does not move all cells.
-    cells = 2 ** round(math.log2(max(len(points) / VERTICES_OF_PATCH, 1)) / 2)
-    low = points.min(0)
-    place = (points - low) / max(float((points - low).max()), np.finfo(float).tiny) * cells
-    cell = np.minimum(place.astype(int), cells - 1)
-    number = np.ravel_multi_index(tuple(cell.T), (cells,) * 3)
-    # By cell, in a cell by distance to its middle.
-    order = np.lexsort((((place - cell - 0.5) ** 2).sum(1), number))
-    first = np.diff(number[order], prepend=-1) > 0
-    rank = generator.exponential(size=cells**3) / np.maximum(np.bincount(number, minlength=cells**3), 1)
-    begin, rest = (some[np.argsort(rank[number[some]], kind="stable")] for some in (order[first], order[~first]))
-    return np.concatenate([begin, rest])
-
-
 def _drawn(seen: Int, surface: Surface, normal: Float, count: int, size: int, generator: np.random.Generator) -> Int:
     """(V,) patch of each vertex, -1 outside of all; all -1 where the mesh has no piece of `size` vertices with one side."""
     tree, wanted = cKDTree(surface.vertices[seen]), -(-count // size)
     patch, number = np.full(len(normal), -1), 0
-    order = _scattered(surface.vertices[seen], generator)
+    order = generator.permutation(len(seen))
     # Neighbours of no more vertices than it takes: few of them begin a patch.
     for start in range(0, len(order), wanted):
         rows = order[start : start + wanted]

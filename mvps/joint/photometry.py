@@ -271,8 +271,6 @@ def photometric_round(
 ) -> dict[str, float]:
     """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
     device = task.device
-    # How much a round draws is no matter of the next one.
-    generator = generator.spawn(1)[0]
 
     part, part_lights = thinned(capture, state.lights)
     state.views = observe(part, state.surface, part_lights, device, shadows=state.law.shadows)

@@ -42,24 +42,23 @@ LEAST_COSINE = 0.5
 little is known to sharpen."""
 
 
-def pixel_blur(camera: Camera, points: Float, cosine: Float) -> Float:
-    """(n,) variance along the surface over which a view's pixels average at points (n, 3) seen under angles with cosines (n,), length^2."""
-    blur: Float = PIXEL_BLUR * footprint(camera, points) ** 2 * (1 + 1 / np.maximum(cosine, LEAST_COSINE) ** 2) / 2
-    return blur
+def pixel_area(camera: Camera, points: Float, cosine: Float) -> Float:
+    """(n,) mean square of the sides of what a pixel covers at points (n, 3) of a surface seen under angles with cosines (n,), length^2."""
+    area: Float = footprint(camera, points) ** 2 * (1 + 1 / np.maximum(cosine, LEAST_COSINE) ** 2) / 2
+    return area
 
 
 def sharpened(
     normal: Float, place: Float, blur: Float, error: Float, around: Callable[[Float], Float], over_some: Callable[[Float], Float]
 ) -> Float:
-    """Normals (n, 3), unit, at place (n, 3), without their blur (n,).
+    """Normals (n, 3), unit, without their blur (n,), at place (n, 3) about the middle of all: squares of places far from it would swallow
+    what neighbours lie apart.
 
     error (n,): their variance along a tangent, NaN where not known; around: S, of values (n, k); over_some: means over some twenty of n
     values, NaN where none is known.
     """
-    # About the middle: squares of places far from it would swallow what neighbours lie apart.
-    centre = place - place.mean(0)
-    near = around(np.column_stack([normal, centre, (centre**2).sum(1)]))
-    spread = (near[:, 6] - 2 * (near[:, 3:6] * centre).sum(1) + (centre**2).sum(1)) / 2
+    near = around(np.column_stack([normal, place, (place**2).sum(1)]))
+    spread = (near[:, 6] - 2 * (near[:, 3:6] * place).sum(1) + (place**2).sum(1)) / 2
     away = normal - near[:, :3]
     apart = over_some((away**2).sum(1) / 2)
     part = np.nan_to_num(1 - error / np.maximum(apart, LEAST_TURN**2)).clip(0)
