@@ -10,7 +10,7 @@ import trimesh
 from sphere_scene import RADIUS, make_sphere
 from test_agreement import true_maps
 
-from mvps.joint.detail import Detailed, detailed, interpolated
+from mvps.joint.detail import Detailed, detailed, directions, interpolated
 from mvps.joint.observe import visible_in
 from mvps.joint.vertices import Moved
 from mvps.measures.ours import mesh_normal_errors, surface_errors
@@ -87,3 +87,11 @@ def test_a_split_ball_is_neither_larger_nor_smaller() -> None:
         np.average(np.linalg.norm(s.vertices[s.faces].mean(1), axis=1) - RADIUS, weights=face_areas(s)) for s in (given.surface, found)
     )
     assert abs(after) < min(abs(before), 0.01)
+
+
+def test_where_the_ends_of_an_edge_are_opposite_the_surface_s_normals_stay() -> None:
+    surface = make_sphere(3).reconstruction.surface
+    own, mean = vertex_normals(surface), 0.5 * normalise(surface.vertices)
+    mean[5] = 0
+    found = directions(mean, surface)
+    assert (found[5] == own[5]).all() and np.allclose(np.delete(found, 5, 0), np.delete(2 * mean, 5, 0))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -11,9 +10,9 @@ from scipy.special import erf
 from sphere_scene import make_sphere
 from test_agreement import true_maps
 
-from mvps.joint.fused import NORMAL_SIGMA, SHARED_SIGMA, _around, _mean_around, face_targets
+from mvps.joint.fused import NORMAL_SIGMA, SHARED_SIGMA, _without_blur, face_targets
 from mvps.joint.observe import visible_in
-from mvps.joint.sharpened import SHARPENING, sharpened
+from mvps.joint.sharpened import SHARPENING
 from mvps.mesh import angles_deg, normalise
 from mvps.scene import Capture, Surface
 
@@ -75,13 +74,6 @@ def sheet(z: np.ndarray) -> tuple[Surface, np.ndarray, np.ndarray]:
     return made, centre[:, 0], np.abs(centre[:, :2]).max(1) < N - 2
 
 
-def without_blur(normal: np.ndarray, blur: np.ndarray, error: np.ndarray, surface: Surface) -> np.ndarray:
-    """As of faces."""
-    place, known = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0), np.ones(len(normal), bool)
-    around, over_some = partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface)
-    return sharpened(normal, place, blur, error, around, over_some)
-
-
 @pytest.mark.parametrize("away", [0.0, 1e7])
 def test_a_blurred_ridge_is_sharpened(away: float) -> None:
     """Of two planes at a right angle, seen as a mean with a standard deviation of 0.6 along x, anywhere in the world. Along the slope
@@ -91,7 +83,7 @@ def test_a_blurred_ridge_is_sharpened(away: float) -> None:
     blurred = normalise(np.stack([erf(x / (0.6 * np.sqrt(2))), 0 * x, np.ones_like(x)], 1))
     true = normalise(np.stack([np.sign(x), 0 * x, np.ones_like(x)], 1))
     everywhere = np.ones(len(x))
-    found = without_blur(blurred, 2 * 0.6**2 / SHARPENING * everywhere, 0 * everywhere, ridge)
+    found = _without_blur(blurred, 2 * 0.6**2 / SHARPENING * everywhere, 0 * everywhere, everywhere > 0, ridge)
     near = inner & (np.abs(x) < 1.5)
     assert angles_deg(found[near], true[near]).mean() < 0.65 * angles_deg(blurred[near], true[near]).mean()
 
@@ -101,8 +93,8 @@ def test_what_is_error_alone_is_not_sharpened() -> None:
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))
     given = normalise(up + np.random.default_rng(5).normal(0, 0.05, up.shape) * [1, 1, 0])
     blur, error = np.full((2, len(x)), [[0.5], [0.05**2]])
-    found = without_blur(given, blur, error, flat)
+    found = _without_blur(given, blur, error, error > 0, flat)
     # Knowing nothing of errors, the same blur makes them half as large again.
-    believed = without_blur(given, blur, 0 * error, flat)
+    believed = _without_blur(given, blur, 0 * error, error > 0, flat)
     plain, kept, blown = (angles_deg(of[inner], up[inner]).mean() for of in (given, found, believed))
     assert kept < 1.15 * plain and blown > 1.3 * plain

@@ -25,6 +25,7 @@ sys.path.insert(0, str(BENCHMARKS))
 import accuracy  # noqa: E402
 import hard_cases  # noqa: E402
 from hard import cases, damage, scenes  # noqa: E402
+from hard.lumps import lumps  # noqa: E402
 
 SMALL = SceneSettings(views=4, lights=5, size=64, noise=0)
 
@@ -281,6 +282,15 @@ def test_a_case_by_chance_is_the_same_again_and_its_truth_is_unharmed(number: in
     assert what == same and not changed_views(sample.given, again.given)
     assert changed_views(sample.given, sample.good)
     assert tuple(view.name for view in sample.good.views) == sample.truth.views
+
+
+@pytest.mark.parametrize("seed", [50, 63])
+def test_lumps_are_one_closed_piece_in_the_unit_ball(seed: int) -> None:
+    made = lumps(seed)
+    mesh = trimesh.Trimesh(made.vertices, made.faces, process=False)
+    assert mesh.is_watertight and mesh.body_count == 1 and mesh.volume > 0
+    assert np.linalg.norm(made.vertices, axis=1).max() == pytest.approx(1)
+    assert len(lumps(seed + 1).vertices) != len(made.vertices)
 
 
 def rows() -> list[dict[str, object]]:

@@ -106,9 +106,14 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
     # Of few lights the maps hold the mesh's own normals (pixels.py), about which views are of one mind.
     sigma = np.inf if few_lights(capture) else np.sqrt(error + SHARED_SIGMA**2)
     blur *= PIXEL_BLUR / np.maximum(weights, LEAST_WEIGHT)
+    return FaceNormals(_without_blur(target, blur, error, known, surface), np.broadcast_to(np.fmin(sigma, NORMAL_SIGMA), len(faces)))
+
+
+def _without_blur(normal: Float, blur: Float, error: Float, known: Bool, surface: Surface) -> Float:
+    """Normals (F, 3), unit, without their blur (F,); error (F,) of theirs along a tangent, NaN where not known."""
+    centre = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0)
     around, over_some = partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface)
-    sharp = sharpened(target, centre - surface.vertices.mean(0), blur, error, around, over_some)
-    return FaceNormals(sharp, np.broadcast_to(np.fmin(sigma, NORMAL_SIGMA), len(faces)))
+    return sharpened(normal, centre, blur, error, around, over_some)
 
 
 def _mean_around(values: Float, surface: Surface) -> Float:

@@ -13,19 +13,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from mvps.camera import view_directions
-from mvps.joint.detail import directions
 from mvps.joint.reflectance import Observed
 from mvps.joint.sharpened import PIXEL_BLUR, pixel_area, sharpened
-from mvps.mesh import edges, neighbour_sums, vertex_normals
+from mvps.joint.stated import averaged
+from mvps.mesh import edges, neighbour_sums, normalise, vertex_normals
 from mvps.scene import Float, Material, Surface
 
 SURFACE_SHARE = 2.0
 """Of the surface's normal over the vertex's own: on seven results 3 was as good, on eighteen 1 was worse (docs/method.md)."""
-
-ROUNDS = 2
-"""Of means with neighbours, over some twenty vertices."""
 
 
 def own_normals(normal: Float, noise: Float, of: Observed) -> Float:
@@ -43,11 +41,8 @@ def own_normals(normal: Float, noise: Float, of: Observed) -> Float:
     count, known = np.maximum(np.bincount(ends.ravel(), minlength=len(normal)), 1), np.isfinite(noise)
 
     def over_some(values: Float) -> Float:
-        for _ in range(ROUNDS):
-            own = np.stack([np.where(known, values, 0), known], 1)
-            sums = own + neighbour_sums(own, ends)
-            values = sums[:, 0] / np.maximum(sums[:, 1], 1)
-        return values
+        of_known = torch.from_numpy(np.where(known, values, 0)[:, None])
+        return averaged(of_known, torch.from_numpy(known), torch.from_numpy(ends))[:, 0].numpy()
 
     # A mean over neighbours has noise of its own.
     error = over_some(noise * (1 + 1 / count))
@@ -58,5 +53,4 @@ def own_normals(normal: Float, noise: Float, of: Observed) -> Float:
 
 def shaded_as(material: Material, surface: Surface) -> Material:
     """The material with normals between its own and those of its surface."""
-    mean = (material.normal + SURFACE_SHARE * vertex_normals(surface)) / (1 + SURFACE_SHARE)
-    return replace(material, normal=directions(mean, surface))
+    return replace(material, normal=normalise(material.normal + SURFACE_SHARE * vertex_normals(surface)))

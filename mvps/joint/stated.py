@@ -77,7 +77,7 @@ def stated_errors(of: Observed, tie: float, finer: bool = False) -> Stated:
     noise = torch.where(seen, noise, 0.0)
     ends = torch.from_numpy(edges(of.surface)).to(seen.device)
     terms = torch.stack([variance, away.square().sum(1) / 2, *_bands(of.vertices.normal, seen, noise, ends)], 1)
-    variance, apart, edge, coarse = _averaged(terms, seen, ends).unbind(1)
+    variance, apart, edge, coarse = averaged(terms, seen, ends).unbind(1)
     edge = edge.clamp_min(0)
     detail = 0.0 if finer else edge * (edge / coarse.clamp_min(1e-12)).clamp_max(1)
     sigma = (1 / (1 / variance + 1 / tie**2) + apart + detail).sqrt()
@@ -121,7 +121,7 @@ def _sums(views: list[ViewSamples], vertices: Vertices, lights: list[Directional
     return hessian, meat, of_kinds, squares, count
 
 
-def _averaged(values: Tensor, known: Tensor, ends: Tensor) -> Tensor:
+def averaged(values: Tensor, known: Tensor, ends: Tensor) -> Tensor:
     """(V, k) values, where known, averaged with their neighbours'."""
     for _ in range(ROUNDS):
         total, count = _summed(values, known, ends)
