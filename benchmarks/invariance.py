@@ -46,12 +46,19 @@ import sys
 import numpy, torch
 import embreex.rtcore_scene, cv2, scipy.ndimage, igl, nlopt
 from skimage.measure import _marching_cubes_lewiner as cubes, _marching_cubes_lewiner_cy as compiled
-single, remap, drawn = numpy.float32, cv2.remap, torch.float32
+single, drawn = numpy.float32, torch.float32
 class Kept:
     def __getattr__(self, name):
         return single if name == "float32" else getattr(numpy, name)
 cubes.np = compiled.np = Kept()
-cv2.remap = lambda image, x, y, *rest, **named: remap(image, x.astype(single), y.astype(single), *rest, **named)
+# OpenCV interpolates between doubles to a 32nd of a pixel.
+def remap(image, x, y, interpolation, dst=None, borderMode=cv2.BORDER_CONSTANT):
+    mode = {cv2.BORDER_CONSTANT: "grid-constant", cv2.BORDER_REPLICATE: "nearest"}[borderMode]
+    at = lambda channel: scipy.ndimage.map_coordinates(channel, (y, x), order=1, mode=mode)
+    if image.ndim == 2:
+        return at(image.astype(float))
+    return numpy.stack([at(channel) for channel in numpy.moveaxis(image.astype(float), 2, 0)], -1)
+cv2.remap = remap
 numpy.float32 = numpy.float64
 torch.float32 = torch.float64
 torch.Tensor.float = torch.Tensor.double

@@ -49,6 +49,9 @@ VERTICES_PER_BLOCK = 256
 OF_LAW = 3
 """Unknowns of the law: grazing, bounce and gleam."""
 
+OfLaw = tuple[bool, bool, bool]
+"""Which of these are free."""
+
 LARGEST_GRAZING = 0.9
 """Of the diffuse term's relative change at 90 degrees: none absorbs all there, none doubles."""
 
@@ -180,7 +183,7 @@ def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
     return H, g
 
 
-def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: tuple[bool, ...]) -> Tensor:
+def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: OfLaw) -> Tensor:
     """dm of the Schur complement. solved: grazing, bounce, gleam."""
     H, g = _lights_equations(sums, layout)
     hessian, gradient = (sums.vertices[:, : -OF_LAW - 1, columns].clone() for columns in (slice(-OF_LAW - 1), -1))
@@ -229,6 +232,18 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     return step
 
 
+def told_by_shadows(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, free: OfLaw
+) -> tuple[Law, OfLaw]:
+    """The law with the bounce that shadows alone tell (shadowed.py), and what is left free of it; as they were where lobes take part, and
+    where shadows are too few."""
+    _, bounce, gleam = free
+    told = bounce_in_shadow(views, vertices, lights, law) if bounce and not gleam else None
+    if told is None:
+        return law, free
+    return _bounded(law, law.grazing, told, law.gleam, vertices), (free[0], False, False)
+
+
 def light_step(
     views: list[ViewSamples],
     vertices: Vertices,
@@ -238,21 +253,17 @@ def light_step(
     patches: Patches,
     rotations: list[Tensor],
     one_rig: bool,
-    free: tuple[bool, bool, bool, bool] = (True, True, True, True),
+    free_lights: bool = True,
+    free: OfLaw = (True, True, True),
 ) -> tuple[list[DirectionalLights], Law]:
-    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated; bounce without gleam from
-    the shadows alone (shadowed.py) where these tell.
+    """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated.
 
     rotations: camera_from_world of the views, float32.
     """
-    reflected = float((vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))).median())
-    told = bounce_in_shadow(views, vertices, lights, law) if free[2] and not free[3] else None
-    if told is not None:
-        law, free = _bounded(law, law.grazing, told, law.gleam, reflected), (*free[:2], False, False)
-    layout = _layout(lights, one_rig, free[0])
-    step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free[1:])
+    layout = _layout(lights, one_rig, free_lights)
+    step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free)
     grazing, bounce, gleam = step[-OF_LAW:].tolist()
-    law = _bounded(law, law.grazing + grazing, law.bounce + bounce, law.gleam + gleam, reflected)
+    law = _bounded(law, law.grazing + grazing, law.bounce + bounce, law.gleam + gleam, vertices)
     if not layout.lights:
         return lights, law
     stepped = []
@@ -267,9 +278,10 @@ def light_step(
     return stepped, law
 
 
-def _bounded(law: Law, grazing: float, bounce: float, gleam: float, reflected: float) -> Law:
+def _bounded(law: Law, grazing: float, bounce: float, gleam: float, vertices: Vertices) -> Law:
     """The law with these, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
-    most = 1 / max(reflected, 1e-300)
+    reflected = vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))
+    most = 1 / max(float(reflected.median()), 1e-300)
     bounce, gleam = (min(max(value, 0.0), most) for value in (bounce, gleam))
     return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=bounce, gleam=gleam)
 

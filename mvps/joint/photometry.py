@@ -23,7 +23,7 @@ from mvps.cores import neighbours
 from mvps.gleam import Senders, patches_of, senders, shiny
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.fused import vertex_maps
-from mvps.joint.lights import light_step, subset, with_mean_one
+from mvps.joint.lights import OfLaw, light_step, subset, told_by_shadows, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.patches import VERTICES_OF_PATCH, Patches, drawn_patches
 from mvps.joint.pixels import all_pixel_normals
@@ -204,7 +204,8 @@ def _solve_lights(
     vertices: Vertices,
     anchor: Anchor,
     patches: Patches,
-    free: tuple[bool, bool, bool, bool],
+    free_lights: bool,
+    of_law: OfLaw,
 ) -> tuple[Lights, float]:
     """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
 
@@ -219,7 +220,7 @@ def _solve_lights(
     before = lights
     for _ in range(LIGHT_STEPS):
         before = lights
-        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, state.lights.one_rig, free)
+        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, state.lights.one_rig, free_lights, of_law)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie, patches=patches)
@@ -295,8 +296,11 @@ def photometric_round(
     state.views = _lit(state, state.views, part, part_lights, sent)
     few = state.views if part is capture else _lit(state, few, capture, state.lights, sent)
     free = with_population(vertices, free)
-    unknown = (task.free_lights, state.model.grazing, state.model.bounce, state.lobed)
-    solved, light_step = _solve_lights(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), patches, unknown)
+    unknown = (state.model.grazing, state.model.bounce, state.lobed)
+    # Of all vertices: few of those drawn for the lights lie deep in shadow.
+    state.law, unknown = told_by_shadows(state.views, vertices, lights, state.law, unknown)
+    tie = replace(free, sigma=LIGHT_TIE)
+    solved, light_step = _solve_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
     moved = light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)

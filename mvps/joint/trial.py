@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights, Vertices, batches, evaluate
-from mvps.joint.lights import light_step
+from mvps.joint.lights import light_step, told_by_shadows
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
 from mvps.joint.shadowed import in_shadow
@@ -61,7 +61,8 @@ def held_out_errors(
         state = vertex_step(fitted, state, lights, law, free, patches=patches)
     law_free = (model.grazing, model.bounce, model.gleam)
     for _ in range(LAW_STEPS if any(law_free) else 0):
-        _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, (False, *law_free))
+        law, left = told_by_shadows(fitted, state, lights, law, law_free)
+        _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, False, left)
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
     shadowed = [in_shadow(samples) for samples in kept]
