@@ -6,12 +6,12 @@ Samples in the light tell b only as far as normals cannot: in a hollow, light be
 (Nayar et al. 1991), so that b = 0 fits a hollow that is too shallow. In shadow there is nothing to take its place. b is the median of I / x
 with the weights
 
-    w min(I, 2 b x)
+    w min(I, (2 b x)^2 / I)
 
-of the pair w and the sample, which up to a third of them may contradict. Weights x would minimise sum w |I - b x|, but x, worked out on a
-mesh that is not yet right, is known less well than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes
-out exp(-s^2) times too small. Weights I favour neither. Where the mesh is wrong, what it thinks in shadow is lit: beyond twice what b
-predicts a sample counts no more.
+of the pair w and the sample. Weights x would minimise sum w |I - b x|, but x, worked out on a mesh that is not yet right, is known less well
+than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes out exp(-s^2) times too small (regression
+dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is beyond twice what
+b predicts, the less it counts.
 
 Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/method.md).
 """
@@ -59,9 +59,9 @@ def bounce_in_shadow(views: list[ViewSamples], vertices: Vertices, lights: list[
     image, sent, weight = (torch.cat(parts) for parts in (shown, sending, weights))
     ratio, order = (image / sent).sort()
     image, sent, weight = image[order].clamp_min(0), sent[order], weight[order]
-    bounce = _middle(ratio, weight * sent)
+    bounce, tiny = _middle(ratio, weight * sent), torch.finfo(image.dtype).tiny
     for _ in range(TIMES):
-        bounce = _middle(ratio, weight * torch.minimum(image, 2 * bounce * sent))
+        bounce = _middle(ratio, weight * torch.minimum(image, (2 * bounce * sent) ** 2 / image.clamp_min(tiny)))
     return bounce
 
 
