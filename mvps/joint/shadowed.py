@@ -8,8 +8,8 @@ with the weights
 
     w min(I, (2 b x)^2 / I)
 
-of the pair w and the sample. Weights x would minimise sum w |I - b x|, but x, worked out on a mesh that is not yet right, is known less well
-than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes out exp(-s^2) times too small (regression
+of the pair w and the sample. Weights x would minimise sum w |I - b x|, but x, worked out on a mesh that is not yet right, is known less
+well than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes out exp(-s^2) times too small (regression
 dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is beyond twice what
 b predicts, the less it counts.
 
@@ -32,7 +32,7 @@ LEAST_SAMPLES = 100
 which so many know to 10 %."""
 
 TIMES = 3
-"""That weights are renewed: from weights x, a fifth too small, the third renewal changes b by a per cent."""
+"""That weights are renewed: from weights x on, with errors of a factor 1.5, the fourth renewal changes b by less than a per cent."""
 
 
 def in_shadow(samples: ViewSamples) -> ViewSamples:
