@@ -9,9 +9,9 @@ with the weights
     w min(I, (2 b x)^2 / I)
 
 of the pair w and the sample. Weights x would minimise sum w |I - b x|, but x, worked out on a mesh that is not yet right, is known less
-well than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes out exp(-s^2) times too small (regression
-dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is beyond twice what
-b predicts, the less it counts.
+well than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes out exp(-s^2) times too small
+(regression dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is
+beyond twice what b predicts, the less it counts.
 
 Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/method.md).
 """
