@@ -77,8 +77,8 @@ def mask_distances(capture: Capture) -> list[NDArray[np.float32]]:
 
 
 def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:
-    """Bilinear values (n[, channels]) of a field (height, width[, channels]) at image coordinates (n, 2), to a 32nd of a pixel; beyond the
-    border its nearest value, or 0 with cv2.BORDER_CONSTANT."""
+    """Bilinear values (n[, channels]) of a field (height, width[, channels]) at image coordinates (n, 2) (OpenCV before 5 rounds these to a
+    32nd of a pixel); beyond the border its nearest value, or 0 with cv2.BORDER_CONSTANT."""
     at = image.astype(np.float32) - np.float32(0.5)
     values = np.empty((len(at), *field.shape[2:]), np.float32)
     for start in range(0, len(at), REMAP_LIMIT):
