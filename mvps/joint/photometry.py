@@ -229,6 +229,19 @@ def _solve_lights(
     return solved, float(np.concatenate(turned).mean())
 
 
+def _with_bounce(state: State, vertices: Vertices, lights: list[DirectionalLights], free: Anchor) -> tuple[Vertices, OfLaw]:
+    """The state's law with the bounce that shadows tell, the vertices with it, and what of the law is left to solve."""
+    unknown = (state.model.grazing, state.model.bounce, state.lobed)
+    # Of all vertices: few of those drawn for the lights lie deep in shadow.
+    law, left = told_by_shadows(state.views, vertices, lights, state.law, unknown)
+    if left == unknown:
+        return vertices, unknown
+    # Albedo that was solved without what arrives from other surfaces is too large, and the bounce too small for it.
+    vertices = vertex_step(state.views, vertices, lights, law, free, stated=False)
+    state.law, left = told_by_shadows(state.views, vertices, lights, law, unknown)
+    return vertices, left
+
+
 def _with_colours(state: State, capture: Capture, few: list[ViewSamples], some: torch.Tensor) -> Lights:
     """The lights with colours from some vertices."""
     assert state.vertices is not None
@@ -296,9 +309,7 @@ def photometric_round(
     state.views = _lit(state, state.views, part, part_lights, sent)
     few = state.views if part is capture else _lit(state, few, capture, state.lights, sent)
     free = with_population(vertices, free)
-    unknown = (state.model.grazing, state.model.bounce, state.lobed)
-    # Of all vertices: few of those drawn for the lights lie deep in shadow.
-    state.law, unknown = told_by_shadows(state.views, vertices, lights, state.law, unknown)
+    vertices, unknown = _with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
     solved, light_step = _solve_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
     moved = light_change(state.lights, solved)
