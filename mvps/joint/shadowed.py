@@ -47,8 +47,13 @@ def in_shadow(samples: ViewSamples) -> ViewSamples:
     return replace(some, data=some.dark)
 
 
-def bounce_in_shadow(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> float | None:
-    """The bounce that shadows tell; None where too few do. A median of ratios I / x, counted in steps: samples are too many to be kept."""
+def bounce_in_shadow(
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, times: int = TIMES
+) -> float | None:
+    """The bounce that shadows tell; None where too few do. A median of ratios I / x, counted in steps: samples are too many to be kept.
+
+    times: that weights are renewed; 0 leaves weights x, with which b predicts samples best (least sum of absolute errors), not least biased.
+    """
     sending = vertices.reflectance[:, 0]
     albedo = float(sending[sending > 0].median()) if bool((sending > 0).any()) else 1.0
     told, count = vertices.reflectance.new_zeros(2 * OCTAVES * STEPS, dtype=torch.float64), 0
@@ -65,7 +70,7 @@ def bounce_in_shadow(views: list[ViewSamples], vertices: Vertices, lights: list[
         return None
     ratio = 2 ** ((torch.arange(len(told), device=told.device) + 0.5) / STEPS - OCTAVES).double()
     bounce = _middle(ratio, told)
-    for _ in range(TIMES):
+    for _ in range(times):
         # Weights x min(r, (2 b)^2 / r), r the ratio.
         bounce = _middle(ratio, told * torch.minimum(ratio, (2 * bounce) ** 2 / ratio))
     return bounce / albedo
