@@ -52,7 +52,7 @@ def bounce_in_shadow(
 ) -> float | None:
     """The bounce that shadows tell; None where too few do. A median of ratios I / x, counted in steps: samples are too many to be kept.
 
-    times: that weights are renewed; 0 leaves weights x, with which b predicts samples best (least sum of absolute errors), not least biased.
+    times: that weights are renewed; 0 leaves weights x, with which b, too small, predicts samples best (least absolute errors).
     """
     sending = vertices.reflectance[:, 0]
     albedo = float(sending[sending > 0].median()) if bool((sending > 0).any()) else 1.0
