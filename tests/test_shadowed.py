@@ -130,8 +130,9 @@ def test_errors_of_what_is_worked_out_to_arrive_do_not_make_the_strength_smaller
         assert s.gathered is not None
         off.append(replace(s, gathered=s.gathered * torch.exp(0.4 * torch.randn(s.gathered.shape, generator=g))))
     told = bounce_in_shadow(off, seen.vertices, seen.grey, DIFFUSE)
-    # With weights x it would be exp(-0.4^2), 0.85 of it.
     assert told is not None and abs(told / BOUNCE - 1) < 0.05
+    best = bounce_in_shadow(off, seen.vertices, seen.grey, DIFFUSE, times=0)
+    assert best is not None and best / BOUNCE == pytest.approx(np.exp(-(0.4**2)), abs=0.05)
 
 
 def test_the_lights_take_the_strength_from_the_shadows_and_stay(seen: Seen) -> None:

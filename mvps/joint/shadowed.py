@@ -31,6 +31,10 @@ LEAST_SAMPLES = 100
 """Where there are fewer, samples in the light have their say: single ones are off by as much as the strength itself (docs/method.md),
 which so many know to 10 %."""
 
+FAR = 2.0
+"""Times what b predicts, beyond which a sample counts less: as far as what arrives is worked out wrongly on a mesh on its way
+(docs/method.md)."""
+
 TIMES = 3
 """That weights are renewed: from weights x on, with errors of a factor 1.5, the fourth renewal changes b by less than a per cent."""
 
@@ -71,8 +75,8 @@ def bounce_in_shadow(
     ratio = 2 ** ((torch.arange(len(told), device=told.device) + 0.5) / STEPS - OCTAVES).double()
     bounce = _middle(ratio, told)
     for _ in range(times):
-        # Weights x min(r, (2 b)^2 / r), r the ratio.
-        bounce = _middle(ratio, told * torch.minimum(ratio, (2 * bounce) ** 2 / ratio))
+        # Weights x min(r, (FAR b)^2 / r), r the ratio.
+        bounce = _middle(ratio, told * torch.minimum(ratio, (FAR * bounce) ** 2 / ratio))
     return bounce / albedo
 
 
