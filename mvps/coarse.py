@@ -1,7 +1,7 @@
 """Shape, lights and normals for the last rounds to start from.
 
 masks -> visual hull -> lights by factorisation -> photometric stereo of every view -> a refinement on the hull
-      -> Stage I and a coarse round of Stage II in turn, while that helps -> hollows that both left, dug (hollows.py)
+      -> Stage I and a coarse round of Stage II in turn, while that helps -> hollows that both left, dug (digging.py)
 """
 
 from __future__ import annotations
@@ -9,16 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from mvps.passes import Begun, stage_one, stage_two
 from mvps.progress import Progress
-from mvps.scene import Capture, Law, Lights, NormalMap
+from mvps.scene import Capture, Lights
 
 if TYPE_CHECKING:
     from mvps.joint.refine import Refined, RefineSettings
-    from mvps.occupancy import Occupancy, OccupancySettings
     from mvps.plan import Parts
     from mvps.reconstruct import Settings
     from mvps.scene import SignedDistanceGrid, Surface
@@ -30,21 +28,10 @@ GOOD_HULL = 0.2
 """Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
 captures, docs/method.md), so it would do no better."""
 
-WORTHWHILE = 0.9
-"""Of the mean share that was unexplained, what is left at most where hollows that were dug stay. Another coarse round alone leaves 0.9 to
-0.96 of it (docs/method.md)."""
-
-DEPTHS = (1.0, 0.5)
-"""Of pits, over the width of the patch: half as deep where as deep as wide is not better."""
-
 MOVING_DEG = 1.0
 """Mean turn of the lights in a round from which on the field has seen other lights than there are: wrong by a degree, they bend normals by
 as much. Where the model fits, lights of eight captures turned by 0.06 to 0.9 deg, and by 3.8 where four views leave the hull four pixels
 off (docs/method.md)."""
-
-HIDDEN = 0.2
-"""Mean depth, pixels, of the hollows that may be hidden where nothing fits (hollows.py) from which they are dug for. Seven captures without
-hollows that Stage I leaves are at 0.02 to 0.1, a vessel and a bowl at 1.2 and 1.4 (docs/method.md)."""
 
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
@@ -77,18 +64,12 @@ def first_lights(capture: Capture, surface: Surface, given: Lights | None, seed:
         return calibration.lights
 
 
-def stage_one(field: Occupancy, maps: tuple[NormalMap, ...], plan: OccupancySettings, progress: Progress, words: str = "") -> Surface:
-    """The occupancy field under the progress bar; words: its status."""
-    with progress.stage("occupancy field", total=plan.steps) as stage:
-        stage.status(words)
-        return field.trained(maps, plan, lambda _, loss: stage.advance(1, loss=loss))
-
-
 def shaped(
     capture: Capture, grid: SignedDistanceGrid, rough: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
 ) -> tuple[Refined, list[dict[str, float]]]:
     """Stage I and a coarse round of Stage II on its surface in turn, then hollows; what Stage II last made, and all its rounds. A hull that
     is good enough stays, but for hollows; an object that the model fits badly all over gives no sign of them."""
+    from mvps.digging import hollowed, pitted
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
 
@@ -104,8 +85,10 @@ def shaped(
         rounds += more
     if found.rounds[-1]["residual"] > POOR_FIT or not all(one.fusions for one in of_turn.rounds):
         return found, rounds
-    found, more = hollowed(capture, grid, found, settings, of_turn, progress)
-    return found, rounds + more
+    for dig in (hollowed, pitted):
+        found, more = dig(capture, grid, found, settings, of_turn, progress)
+        rounds += more
+    return found, rounds
 
 
 def in_turn(
@@ -140,91 +123,6 @@ def in_turn(
         if (residual <= POOR_FIT and turned <= MOVING_DEG) or residual >= before:
             break
     return refined, rounds
-
-
-def hollowed(
-    capture: Capture, grid: SignedDistanceGrid, found: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
-) -> tuple[Refined, list[dict[str, float]]]:
-    """Stage II with hollows dug that neither Stage I nor photographs reach (hollows.py), and the rounds that this took; as it was found
-    where there are none, or where the model explains no more of the photographs with them.
-
-    Pits are dug one into the other while that helps, each after a single round: what still moves is dug anew. Then Stage I goes on from
-    their bottoms, whose normals it now has.
-    """
-    from mvps.camera import pixel_footprint
-    from mvps.device import chosen_device
-    from mvps.hollows import beyond_noise, dug, hidden, solid
-    from mvps.hull import visual_hull
-    from mvps.occupancy import CONTINUED, Occupancy
-    from mvps.plan import once
-    from mvps.verdict import INTERPOLATED, noise_share
-
-    noise = INTERPOLATED * noise_share(capture)
-    pixel = pixel_footprint([view.camera for view in capture.views], found.surface.vertices.mean(0))
-
-    def unexplained(of: Refined) -> Any:
-        return beyond_noise(of.unexplained, noise)
-
-    def worth_digging(of: Refined) -> bool:
-        return hidden(of.surface, unexplained(of)) > HIDDEN * pixel
-
-    def better(after: Refined, before: Refined, share: float = 1.0) -> bool:
-        return bool(np.nanmean(unexplained(after)) < share * np.nanmean(unexplained(before)))
-
-    best, rounds = found, list[dict[str, float]]()
-    for depth in DEPTHS:
-        for _ in range(MOST_TURNS):
-            if not worth_digging(best):
-                return best, rounds
-            trial, taken = best, []
-            for _ in range(MOST_TURNS):
-                before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth))
-                trial = stage_two("hollows", capture, surface, before, once(of_turn), settings, progress)
-                taken += trial.rounds
-                if not (better(trial, before) and worth_digging(trial)):
-                    break
-            field = Occupancy(capture, solid(trial.surface, grid), CONTINUED, settings.seed, chosen_device(settings.device))
-            surface = stage_one(field, trial.maps, CONTINUED, progress)
-            trial = stage_two("coarse refinement", capture, surface, trial, of_turn, settings, progress)
-            if not better(trial, best, WORTHWHILE):
-                break
-            best, rounds = trial, rounds + taken + trial.rounds
-    return best, rounds
-
-
-def stage_two(
-    name: str,
-    capture: Capture,
-    surface: Surface,
-    of: Begun | Refined,
-    plan: RefineSettings,
-    settings: Settings,
-    progress: Progress,
-    carried: tuple[Surface, Any] | None = None,
-) -> Refined:
-    """Rounds of Stage II under the progress bar, from a surface and the lights, normal maps and image model `of` what came before."""
-    from mvps.device import chosen_device
-    from mvps.joint.refine import refine
-
-    with progress.stage(name, total=len(plan.rounds)) as stage:
-
-        def on_round(_: int, changes: dict[str, float]) -> None:
-            stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg", "vertex_change_px")})
-
-        device = chosen_device(settings.device)
-        refined = refine(capture, surface, of.lights, of.maps, of.law, plan, settings.seed, device, on_round, carried)
-        stage.status(refined.status)
-    return refined
-
-
-class Begun(NamedTuple):
-    """What Stage II starts with: the hull, as a grid too, lights, and the views' photometric stereo under them."""
-
-    grid: SignedDistanceGrid
-    surface: Surface
-    lights: Lights
-    maps: tuple[NormalMap, ...]
-    law: Law
 
 
 def begin(capture: Capture, masks: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress) -> Begun:

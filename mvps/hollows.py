@@ -13,7 +13,11 @@ a way back). The mean of L over what is seen,
 
     hidden_px = mean of L, pixels,
 
-says how far off the surface is likely to be for this alone.
+says how far off the surface is likely to be for this alone. Of small pits what the model explains of the whole object says nothing, and
+
+    misfit = mean of min(u, 1)^2 over what is seen within the balls
+
+does: few samples, or dark ones, have u without bounds.
 """
 
 from __future__ import annotations
@@ -55,8 +59,27 @@ def clearance(surface: Surface, unexplained: Float) -> Float:
 
 def hidden(surface: Surface, unexplained: Float) -> float:
     """Mean of L over the surface that is seen, world units."""
+    return mean_depth(surface, unexplained, clearance(surface, unexplained))
+
+
+def mean_depth(surface: Surface, unexplained: Float, depth: Float) -> float:
+    """Mean of depths (V,) over the surface that is seen, in their unit; unexplained (V,): NaN where no view sees a vertex."""
     area = np.where(np.isfinite(unexplained), vertex_areas(surface), 0)
-    return float((clearance(surface, unexplained) * area).sum() / max(area.sum(), np.finfo(float).tiny))
+    return float((depth * area).sum() / max(area.sum(), np.finfo(float).tiny))
+
+
+def pits(surface: Surface, unexplained: Float, spacing: float) -> Float:
+    """L (V,) where a grid of this spacing can hold a ball of it, 0 elsewhere."""
+    depth = clearance(surface, unexplained)
+    return np.where(depth >= spacing, depth, 0)
+
+
+def misfit(surface: Surface, unexplained: Float, centre: Float, radius: Float) -> float:
+    """The misfit of a surface, whose vertices leave the shares `unexplained` (V,), within balls with centres (n, 3) and radii (n,); 0 where
+    none of what is seen lies there."""
+    distance, nearest = neighbours(cKDTree(centre), surface.vertices)
+    share = unexplained[(distance <= radius[nearest]) & np.isfinite(unexplained)]
+    return float((share.clip(max=1) ** 2).mean()) if len(share) else 0.0
 
 
 def solid(surface: Surface, like: SignedDistanceGrid) -> SignedDistanceGrid:

@@ -89,7 +89,8 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
 
 def drafted(used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step) -> Refined:
     """Stage II on the hull alone."""
-    from mvps.coarse import begin, stage_two
+    from mvps.coarse import begin
+    from mvps.passes import stage_two
     from mvps.plan import first_pass
 
     begun, plan = begin(used, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, True))
@@ -108,12 +109,13 @@ def reconstruct(
 ) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
-    from mvps.coarse import coarse, stage_two
+    from mvps.coarse import coarse
     from mvps.cores import blas_as_asked
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
     from mvps.own_units import in_lengths, in_world_units, own_length
+    from mvps.passes import stage_two
     from mvps.plan import Parts, last_pass
     from mvps.pyramid import halvings
 

@@ -11,13 +11,14 @@ from dataclasses import asdict
 
 import numpy as np
 
-from mvps.coarse import begin, first_lights, rough_shape, stage_one, stage_two
+from mvps.coarse import begin, first_lights, rough_shape
 from mvps.device import chosen_device
 from mvps.joint.lambertian import lambertian
 from mvps.joint.thinned import thinned
 from mvps.measures import mesh_normals
 from mvps.occupancy import Occupancy, OccupancySettings
 from mvps.outcome import all_lights, versions
+from mvps.passes import stage_one, stage_two
 from mvps.photometric import normal_maps
 from mvps.plan import Parts, first_pass
 from mvps.progress import Progress

@@ -10,10 +10,12 @@ import pytest
 import trimesh
 from sphere_scene import make_sphere
 
-from mvps.coarse import MOST_TURNS, begin, hollowed, stage_two
-from mvps.hollows import beyond_noise, clearance, dug, hidden, solid, thickness
+from mvps.coarse import begin
+from mvps.digging import MOST_TURNS, hollowed, pitted
+from mvps.hollows import beyond_noise, clearance, dug, hidden, mean_depth, misfit, pits, solid, thickness
 from mvps.hull import visual_hull
 from mvps.mesh import vertex_areas, vertex_normals
+from mvps.passes import stage_two
 from mvps.plan import Parts, carving_pass
 from mvps.progress import Progress
 from mvps.reconstruct import Settings
@@ -122,14 +124,14 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
         unexplained = np.where(bad, next(values), 0.0)
         return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), rounds=[{"number": float(next(counted))}])
 
-    monkeypatch.setattr("mvps.coarse.stage_one", lambda *_: wide)
+    monkeypatch.setattr("mvps.digging.stage_one", lambda *_: wide)
     repeated: dict[str, set[bool]] = {}
 
     def stage_two(name: str, *given: Any) -> Any:
         repeated.setdefault(name, set()).add(np.isfinite(given[3].rounds[0].still))
         return refined()
 
-    monkeypatch.setattr("mvps.coarse.stage_two", stage_two)
+    monkeypatch.setattr("mvps.digging.stage_two", stage_two)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
     monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
     monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
@@ -140,6 +142,53 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
     # Pits are dug on after a round each; where Stage I has been, vertices come to rest.
     assert repeated in ({}, {"hollows": {False}, "coarse refinement": {True}})
     assert (best is found) == (kept == 0)
+
+
+def test_misfit_is_of_what_is_seen_in_the_balls() -> None:
+    surface = cylinder()
+    top = np.array([[0.0, 0.0, 2.0]])
+    inside = np.linalg.norm(surface.vertices - top, axis=1) <= 0.3
+    unexplained = np.where(inside, 0.5, 7.0)
+    unexplained[np.flatnonzero(inside)[0]] = np.nan
+    assert misfit(surface, unexplained, top, np.array([0.3])) == pytest.approx(0.25)
+    # A sample of next to nothing counts as one that the model says nothing of.
+    assert misfit(surface, np.full(len(inside), 1e8), top, np.array([0.3])) == 1
+    assert misfit(surface, unexplained, top + 9, np.array([0.3])) == 0
+
+
+def test_pits_are_what_the_grid_can_hold() -> None:
+    surface = cylinder()
+    unexplained = patch_on_top(surface)
+    depth, wide = pits(surface, unexplained, 0.3), clearance(surface, unexplained)
+    assert (depth[wide >= 0.3] == wide[wide >= 0.3]).all() and not depth[wide < 0.3].any() and 0 < (depth > 0).sum() < (wide > 0).sum()
+    assert mean_depth(surface, unexplained, depth) < hidden(surface, unexplained)
+
+
+@pytest.mark.parametrize(
+    ("left", "made", "kept"),
+    [((0.1,), 0, 0), ((0.6, 0.1), 1, 1), ((0.6, 0.5), 1, 0), ((0.9, 0.6, 0.4, 0.35), 3, 2), ((0.8, 1e8), 1, 0)],
+    ids=["no sign", "there", "hardly better", "pit in pit", "worse"],
+)
+def test_pits_stay_that_halve_what_is_left_unexplained_in_them(
+    left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """left: what the patch leaves unexplained, as found and after every round."""
+    capture = make_sphere(3).capture
+    surface = cylinder()
+    wide = Surface(surface.vertices * 40, surface.faces)
+    bad = patch_on_top(surface) > 0.5
+    values, counted = iter(left), iter(range(1, 200))
+
+    def refined() -> Any:
+        unexplained = np.where(bad, next(values), 0.0)
+        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), rounds=[{"number": float(next(counted))}])
+
+    monkeypatch.setattr("mvps.digging.stage_two", lambda *_: refined())
+    monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
+    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
+    found, grid = refined(), SignedDistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 2.0)
+    best, rounds = pitted(capture, grid, found, Settings("somewhere"), carving_pass(True, True), None)  # type: ignore[arg-type]
+    assert next(counted) - 2 == made and len(rounds) == kept and (best is found) == (kept == 0)
 
 
 def vessel(settings: SceneSettings) -> Scene:

@@ -1,0 +1,127 @@
+"""Hollows that Stage I and photographs left, dug (hollows.py): wide ones first, pit into pit, then single pits.
+
+Whether they stay is for the photographs to say, of which the model must then explain more: of the whole object where hollows are wide,
+within the balls that were dug where they are small.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mvps.passes import stage_one, stage_two
+from mvps.progress import Progress
+from mvps.scene import Capture, Float
+
+if TYPE_CHECKING:
+    from mvps.joint.refine import Refined, RefineSettings
+    from mvps.reconstruct import Settings
+    from mvps.scene import SignedDistanceGrid, Surface
+
+WORTHWHILE = 0.9
+"""Of the mean share that was unexplained, what is left at most where hollows that were dug stay. Another coarse round alone leaves 0.9 to
+0.96 of it (docs/method.md)."""
+
+DEPTHS = (1.0, 0.5)
+"""Of pits, over the width of the patch: half as deep where as deep as wide is not better."""
+
+HIDDEN = 0.2
+"""Mean depth, pixels, of the hollows that may be hidden where nothing fits (hollows.py) from which they are dug for. Seven captures without
+hollows that Stage I leaves are at 0.02 to 0.1, a vessel and a bowl at 1.2 and 1.4 (docs/method.md)."""
+
+PITS = 0.01
+"""Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/method.md)."""
+
+HALVED = 0.5
+"""Of the misfit of pits, what is left at most where they stay. 0.19 to 0.40 was left of what hid a hollow, 0.94 and more of what did not,
+or a deeper one (eight captures, docs/method.md)."""
+
+MOST_TURNS = 6
+"""As long as it helps, each of them."""
+
+
+def hollowed(
+    capture: Capture, grid: SignedDistanceGrid, found: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
+) -> tuple[Refined, list[dict[str, float]]]:
+    """Stage II with hollows dug that neither Stage I nor photographs reach (hollows.py), and the rounds that this took; as it was found
+    where there are none, or where the model explains no more of the photographs with them.
+
+    Pits are dug one into the other while that helps, each after a single round: what still moves is dug anew. Then Stage I goes on from
+    their bottoms, whose normals it now has.
+    """
+    from mvps.device import chosen_device
+    from mvps.hollows import dug, hidden, solid
+    from mvps.hull import visual_hull
+    from mvps.occupancy import CONTINUED, Occupancy
+    from mvps.plan import once
+
+    unexplained, pixel = partial(beyond_photographs_noise, capture), pixel_of(capture, found.surface)
+
+    def worth_digging(of: Refined) -> bool:
+        return hidden(of.surface, unexplained(of)) > HIDDEN * pixel
+
+    def better(after: Refined, before: Refined, share: float = 1.0) -> bool:
+        return bool(np.nanmean(unexplained(after)) < share * np.nanmean(unexplained(before)))
+
+    best, rounds = found, list[dict[str, float]]()
+    for depth in DEPTHS:
+        for _ in range(MOST_TURNS):
+            if not worth_digging(best):
+                return best, rounds
+            trial, taken = best, []
+            for _ in range(MOST_TURNS):
+                before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth))
+                trial = stage_two("hollows", capture, surface, before, once(of_turn), settings, progress)
+                taken += trial.rounds
+                if not (better(trial, before) and worth_digging(trial)):
+                    break
+            field = Occupancy(capture, solid(trial.surface, grid), CONTINUED, settings.seed, chosen_device(settings.device))
+            surface = stage_one(field, trial.maps, CONTINUED, progress)
+            trial = stage_two("coarse refinement", capture, surface, trial, of_turn, settings, progress)
+            if not better(trial, best, WORTHWHILE):
+                break
+            best, rounds = trial, rounds + taken + trial.rounds
+    return best, rounds
+
+
+def pitted(
+    capture: Capture, grid: SignedDistanceGrid, found: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
+) -> tuple[Refined, list[dict[str, float]]]:
+    """Stage II with pits dug that are too small to show in the whole, and the rounds that this took, one each time: Stage I would fill
+    them again in part. As it was found where there are none, or where the model explains no more in them."""
+    from mvps.hollows import dug, mean_depth, misfit, pits
+    from mvps.hull import visual_hull
+    from mvps.plan import once
+
+    pixel = pixel_of(capture, found.surface)
+    best, rounds = found, list[dict[str, float]]()
+    left = beyond_photographs_noise(capture, best)
+    for _ in range(MOST_TURNS):
+        depth = pits(best.surface, left, grid.spacing)
+        if mean_depth(best.surface, left, depth) <= PITS * pixel:
+            break
+        trial = stage_two("pits", capture, visual_hull(dug(best.surface, left, grid)), best, once(of_turn), settings, progress)
+        after = beyond_photographs_noise(capture, trial)
+        # Ground that was dug is a cell away from the balls at most.
+        balls = best.surface.vertices[depth > 0], depth[depth > 0] + grid.spacing
+        if misfit(trial.surface, after, *balls) > HALVED * misfit(best.surface, left, *balls):
+            break
+        best, left, rounds = trial, after, rounds + trial.rounds
+    return best, rounds
+
+
+def beyond_photographs_noise(capture: Capture, of: Refined) -> Float:
+    """(V,) what the model leaves unexplained of the vertices' samples beyond the photographs' noise, shares of the signal."""
+    from mvps.hollows import beyond_noise
+    from mvps.verdict import INTERPOLATED, noise_share
+
+    return beyond_noise(of.unexplained, INTERPOLATED * noise_share(capture))
+
+
+def pixel_of(capture: Capture, surface: Surface) -> float:
+    """What a pixel covers at the surface, world units."""
+    from mvps.camera import pixel_footprint
+
+    return pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
