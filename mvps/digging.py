@@ -35,8 +35,8 @@ PITS = 0.01
 """Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/method.md)."""
 
 HALVED = 0.5
-"""Of the misfit of pits, what is left at most where they stay. 0.19 to 0.40 was left of what hid a hollow, 0.94 and more of what did not,
-or a deeper one (eight captures, docs/method.md)."""
+"""Of the misfit of pits, what is left at most where they stay. 0.19 to 0.40 was left of what hid a hollow, 0.58 and more of what did not or
+of a deeper one, and 0.64 to 1.0 by a round without digging (docs/method.md)."""
 
 MOST_TURNS = 6
 """As long as it helps, each of them."""
