@@ -75,11 +75,11 @@ def pits(surface: Surface, unexplained: Float, spacing: float) -> Float:
 
 
 def misfit(surface: Surface, unexplained: Float, centre: Float, radius: Float) -> float:
-    """The misfit of a surface, whose vertices leave the shares `unexplained` (V,), within balls with centres (n, 3) and radii (n,); 0 where
-    none of what is seen lies there."""
+    """The misfit of a surface, whose vertices leave the shares `unexplained` (V,), within balls with centres (n, 3) and radii (n,); 1 where
+    nothing of it there is seen, which explains nothing."""
     distance, nearest = neighbours(cKDTree(centre), surface.vertices)
     share = unexplained[(distance <= radius[nearest]) & np.isfinite(unexplained)]
-    return float((share.clip(max=1) ** 2).mean()) if len(share) else 0.0
+    return float((share.clip(max=1) ** 2).mean()) if len(share) else 1.0
 
 
 def solid(surface: Surface, like: SignedDistanceGrid) -> SignedDistanceGrid:

@@ -153,7 +153,8 @@ def test_misfit_is_of_what_is_seen_in_the_balls() -> None:
     assert misfit(surface, unexplained, top, np.array([0.3])) == pytest.approx(0.25)
     # A sample of next to nothing counts as one that the model says nothing of.
     assert misfit(surface, np.full(len(inside), 1e8), top, np.array([0.3])) == 1
-    assert misfit(surface, unexplained, top + 9, np.array([0.3])) == 0
+    # What no view sees there explains nothing.
+    assert misfit(surface, unexplained, top + 9, np.array([0.3])) == 1
 
 
 def test_pits_are_what_the_grid_can_hold() -> None:
