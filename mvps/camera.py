@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.mesh import normalise
-from mvps.scene import Bool, Camera, Float, Int
+from mvps.scene import Bool, Camera, Capture, Float, Int, Surface
 
 DILIGENT_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 """Axes of DiLiGenT's lights and normals (x right, y up, z towards the camera) from OpenCV camera axes; its own inverse."""
@@ -54,6 +54,11 @@ def footprint(camera: Camera, points: Float) -> Float:
 def pixel_footprint(cameras: list[Camera], point: Float) -> float:
     """Median side length of a pixel at a world point (3,) over several cameras: the natural unit of length of a capture."""
     return float(np.median([footprint(camera, point) for camera in cameras]))
+
+
+def surface_pixel(capture: Capture, surface: Surface) -> float:
+    """What a pixel covers at the surface, world units."""
+    return pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
 
 
 def inside_image(camera: Camera, image: Float) -> Bool:

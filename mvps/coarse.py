@@ -40,13 +40,13 @@ long as the residual falls."""
 
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
-    from mvps.camera import pixel_footprint
+    from mvps.camera import surface_pixel
     from mvps.hull import default_cells, signed_distance, visual_hull
 
     with progress.stage("visual hull") as stage:
         grid = signed_distance(capture, default_cells(capture))
         surface = visual_hull(grid)
-        pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+        pixel = surface_pixel(capture, surface)
         stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing / pixel:.2g} pixels")
     return grid, surface
 

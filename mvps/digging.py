@@ -6,7 +6,6 @@ within the balls that were dug where they are small.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +17,7 @@ from mvps.scene import Capture, Float
 if TYPE_CHECKING:
     from mvps.joint.refine import Refined, RefineSettings
     from mvps.reconstruct import Settings
-    from mvps.scene import SignedDistanceGrid, Surface
+    from mvps.scene import SignedDistanceGrid
 
 WORTHWHILE = 0.9
 """Of the mean share that was unexplained, what is left at most where hollows that were dug stay. Another coarse round alone leaves 0.9 to
@@ -51,13 +50,18 @@ def hollowed(
     Pits are dug one into the other while that helps, each after a single round: what still moves is dug anew. Then Stage I goes on from
     their bottoms, whose normals it now has.
     """
+    from mvps.camera import surface_pixel
     from mvps.device import chosen_device
-    from mvps.hollows import dug, hidden, solid
+    from mvps.hollows import beyond_noise, dug, hidden, solid
     from mvps.hull import visual_hull
     from mvps.occupancy import CONTINUED, Occupancy
     from mvps.plan import once
+    from mvps.verdict import samples_noise
 
-    unexplained, pixel = partial(beyond_photographs_noise, capture), pixel_of(capture, found.surface)
+    noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
+
+    def unexplained(of: Refined) -> Float:
+        return beyond_noise(of.unexplained, noise)
 
     def worth_digging(of: Refined) -> bool:
         return hidden(of.surface, unexplained(of)) > HIDDEN * pixel
@@ -91,37 +95,24 @@ def pitted(
 ) -> tuple[Refined, list[dict[str, float]]]:
     """Stage II with pits dug that are too small to show in the whole, and the rounds that this took, one each time: Stage I would fill
     them again in part. As it was found where there are none, or where the model explains no more in them."""
-    from mvps.hollows import dug, mean_depth, misfit, pits
+    from mvps.camera import surface_pixel
+    from mvps.hollows import beyond_noise, dug, mean_depth, misfit, pits
     from mvps.hull import visual_hull
     from mvps.plan import once
+    from mvps.verdict import samples_noise
 
-    pixel = pixel_of(capture, found.surface)
+    noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
     best, rounds = found, list[dict[str, float]]()
-    left = beyond_photographs_noise(capture, best)
+    left = beyond_noise(best.unexplained, noise)
     for _ in range(MOST_TURNS):
         depth = pits(best.surface, left, grid.spacing)
         if mean_depth(best.surface, left, depth) <= PITS * pixel:
             break
         trial = stage_two("pits", capture, visual_hull(dug(best.surface, left, grid)), best, once(of_turn), settings, progress)
-        after = beyond_photographs_noise(capture, trial)
+        after = beyond_noise(trial.unexplained, noise)
         # Ground that was dug is a cell away from the balls at most.
         balls = best.surface.vertices[depth > 0], depth[depth > 0] + grid.spacing
         if misfit(trial.surface, after, *balls) > HALVED * misfit(best.surface, left, *balls):
             break
         best, left, rounds = trial, after, rounds + trial.rounds
     return best, rounds
-
-
-def beyond_photographs_noise(capture: Capture, of: Refined) -> Float:
-    """(V,) what the model leaves unexplained of the vertices' samples beyond the photographs' noise, shares of the signal."""
-    from mvps.hollows import beyond_noise
-    from mvps.verdict import INTERPOLATED, noise_share
-
-    return beyond_noise(of.unexplained, INTERPOLATED * noise_share(capture))
-
-
-def pixel_of(capture: Capture, surface: Surface) -> float:
-    """What a pixel covers at the surface, world units."""
-    from mvps.camera import pixel_footprint
-
-    return pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
-from mvps.camera import bilinear, footprint, inside_image, pixel_footprint, project, view_directions
+from mvps.camera import bilinear, footprint, inside_image, project, surface_pixel, view_directions
 from mvps.cores import on_cores, one_by_one
 from mvps.gleam import Senders
 from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
@@ -92,7 +92,7 @@ def bake(
     ValueError where the lights do not fit the capture's photographs.
     """
     _check_lights(lights, capture)
-    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    pixel = surface_pixel(capture, surface)
     normal = normalise(vertex_normals(surface))
     levels = (surface, *shells)
     # Charts are cut on one core: meanwhile it is told what sends light to where.

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from mvps.camera import pixel_footprint, project, view_directions
+from mvps.camera import project, surface_pixel, view_directions
 from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.hollows import beyond_noise, hidden
@@ -85,6 +85,11 @@ def noise_share(capture: Capture) -> float:
     return float(np.median(found)) if found else 0.0
 
 
+def samples_noise(capture: Capture) -> float:
+    """`noise_share` of vertices' samples, which are interpolated between pixels."""
+    return INTERPOLATED * noise_share(capture)
+
+
 def median(values: Float, area: Float) -> float:
     """The value (n,) that half of the area (n,) is not above; 0 of none."""
     return float(np.quantile(values, 0.5, weights=area, method="inverted_cdf")) if len(values) and area.any() else 0.0
@@ -129,7 +134,7 @@ def depth_px(capture: Capture, surface: Surface, material: Material, seen: Seque
     alone, several = surface.vertices[views == 1], surface.vertices[views > 1]
     if not len(alone):
         return 0.0
-    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    pixel = surface_pixel(capture, surface)
     radius = lengths(surface.vertices - surface.vertices.mean(0)).mean()
     away = neighbours(cKDTree(several), alone)[0] if len(several) else np.full(len(alone), radius)
     error = np.radians(expected_error_deg(material.confidence[views == 1]))
@@ -170,7 +175,7 @@ def hidden_px(capture: Capture, surface: Surface, unexplained: Float, noise: flo
     """`hidden_px` above; 0 for a single view, which has no hull to bridge a hollow."""
     if len(capture.views) == 1:
         return 0.0
-    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    pixel = surface_pixel(capture, surface)
     return hidden(surface, beyond_noise(unexplained, noise)) / pixel
 
 
@@ -182,7 +187,7 @@ def signs(
     unexplained: Float,
 ) -> dict[str, float]:
     """The figures above. unexplained (V,): what the model leaves, as a share of every vertex's signal, NaN where no view sees it."""
-    noise, seen, area = INTERPOLATED * noise_share(capture), seen_by(capture, surface), vertex_areas(surface)
+    noise, seen, area = samples_noise(capture), seen_by(capture, surface), vertex_areas(surface)
     known = np.isfinite(unexplained)
     return {
         "misfit": median(beyond_noise(unexplained[known], noise), area[known]),

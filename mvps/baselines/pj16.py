@@ -36,7 +36,7 @@ from mvps.baselines.pj16_displacement import displaced
 from mvps.baselines.pj16_domain import Domain, flattened, warped
 from mvps.baselines.pj16_stereo import TexelNormals, lights_on, texel_normals
 from mvps.calibrate import MINIMUM_LIGHTS, Calibration, uncalibrated_lights
-from mvps.camera import pixel_footprint
+from mvps.camera import surface_pixel
 from mvps.hull import default_cells, signed_distance, visual_hull
 from mvps.mesh import face_normals, isotropic_remesh, lengths, normalise, vertex_normals
 from mvps.progress import Progress
@@ -82,7 +82,7 @@ def pj16(capture: Capture, seed: int, progress: Progress) -> Reconstruction:
     with progress.stage("visual hull"):
         coarse = signed_distance(capture, default_cells(capture))
         surface = visual_hull(coarse)
-        pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+        pixel = surface_pixel(capture, surface)
     moved: Float = np.zeros(1)
     for level in LEVELS:
         surface = isotropic_remesh(surface, level.edge * pixel)

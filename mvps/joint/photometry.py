@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from mvps.bounce import Gather
-from mvps.camera import pixel_footprint
+from mvps.camera import surface_pixel
 from mvps.cores import neighbours
 from mvps.gleam import Senders, patches_of, senders, shiny
 from mvps.joint.blocks import DirectionalLights, Vertices
@@ -211,7 +211,7 @@ def _solve_lights(
 
     Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
     """
-    pixel = pixel_footprint([view.camera for view in capture.views], state.surface.vertices.mean(0))
+    pixel = surface_pixel(capture, state.surface)
     single = of_one_normal(state.surface, vertices.normal, pixel, max(state.law.sharpness, default=1.0))
     few = [replace(samples, weight=samples.weight * single[samples.vertex]) for samples in few]
     few, part, tie = subset(few, vertices, anchor, patches.vertex)

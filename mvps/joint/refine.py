@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from mvps.camera import pixel_footprint
+from mvps.camera import surface_pixel
 from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
@@ -204,7 +204,7 @@ def refine(
     """
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
-    pixel = pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+    pixel = surface_pixel(capture, surface)
     state = State(surface, lights, maps, law, settings.model)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
