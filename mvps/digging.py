@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mvps.noise import samples_noise
 from mvps.passes import stage_one, stage_two
 from mvps.progress import Progress
 from mvps.scene import Capture, Float
@@ -56,7 +57,6 @@ def hollowed(
     from mvps.hull import visual_hull
     from mvps.occupancy import CONTINUED, Occupancy
     from mvps.plan import once
-    from mvps.verdict import samples_noise
 
     noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
 
@@ -99,7 +99,6 @@ def pitted(
     from mvps.hollows import beyond_noise, dug, mean_depth, misfit, pits
     from mvps.hull import visual_hull
     from mvps.plan import once
-    from mvps.verdict import samples_noise
 
     noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
     best, rounds = found, list[dict[str, float]]()

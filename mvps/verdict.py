@@ -11,9 +11,6 @@ depth_px      mean of e L: what one view alone sees has its depth from normals, 
               radians) all over the distance of L pixels from the nearest vertex that a second view sees, it is e L off; 0 where two see
 photographs   median of how many photographs show a vertex
 hidden_px     mean of how deep hollows may be where the model explains nothing (hollows.py)
-
-Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
-sigma = median |I(x - 1) - 2 I(x) + I(x + 1)| / (0.6745 sqrt(6)); vertices interpolate between four pixels, which leaves two thirds of it.
 """
 
 from __future__ import annotations
@@ -30,6 +27,7 @@ from mvps.finding import Finding
 from mvps.hollows import beyond_noise, hidden
 from mvps.material import POOR_FIT
 from mvps.mesh import lengths, normalise, vertex_areas, vertex_normals
+from mvps.noise import samples_noise
 from mvps.scene import Capture, Float, Int, Material, Surface, View, expected_error_deg
 from mvps.silhouette import mask_distances, sampled
 from mvps.visibility import RayCaster, camera_hits, ray_caster, visible_vertices
@@ -56,38 +54,6 @@ OUTLINE_PIXELS = 1.0
 
 BAND_PIXELS = 8.0
 """Farthest from a mask's outline that pixels are asked for the mesh."""
-
-INTERPOLATED = 2 / 3
-"""Part of the pixels' noise that is left between four of them, root mean square over all places."""
-
-LIGHTS_ASKED = 4
-"""Photographs of each view from which its noise is estimated."""
-
-
-def noise_share(capture: Capture) -> float:
-    """Standard deviation of the grey photographs' noise over the root mean square of their signal; median over photographs."""
-
-    def of_view(view: View) -> list[float]:
-        shares = []
-        for k in range(0, len(view.lights), max(1, len(view.lights) // LIGHTS_ASKED)):
-            if not view.usable([k]).any():
-                continue
-            image = np.full(view.mask.shape, np.nan)
-            image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
-            second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
-            second = second[np.isfinite(second)]
-            level = np.sqrt(np.nanmean(image**2))
-            if len(second) and level > 0:
-                shares.append(float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6)) / level))
-        return shares
-
-    found = [share for shares in on_cores(of_view, capture.views) for share in shares]
-    return float(np.median(found)) if found else 0.0
-
-
-def samples_noise(capture: Capture) -> float:
-    """`noise_share` of vertices' samples, which are interpolated between pixels."""
-    return INTERPOLATED * noise_share(capture)
 
 
 def median(values: Float, area: Float) -> float:

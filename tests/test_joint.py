@@ -364,6 +364,6 @@ def test_of_few_photographs_more_vertices_try_the_models_components(
     monkeypatch.setattr("mvps.joint.photometry.ENOUGH_PHOTOGRAPHS", fewer * photographs)
     seen = torch.cat([samples.vertex for samples in views]).unique().numpy()
     patches = drawn_patches(seen, surface, start.normal.numpy(), LIGHT_VERTICES, np.random.default_rng(0), CPU)
-    state = State(surface, scene.reconstruction.lights, (), law, Model())
+    state = State(surface, scene.reconstruction.lights, (), law, Model(), 0.0)
     lit, _ = _errors(state, scene.capture, views, start, free_reflectance(start.normal, 1.0, 2), patches)(Model())
     assert len(lit) == pytest.approx(min(fewer * TRIAL_VERTICES, len(patches.vertex)), rel=0.1)

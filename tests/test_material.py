@@ -115,5 +115,5 @@ def test_lobes_are_kept_on_a_glossy_ball_alone(scene: SphereScene, glossy: bool)
     tie = free_reflectance(normal, 0.05, 1)
     rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32) for view in scene.capture.views]
     views, start, tie, patches = in_patches(r.surface, views, start, tie)
-    model, _ = choose(Model((12.0, 60.0)), lambda m: held_out_errors(views, start, lights, tie, patches, rotations, Law(()), m)[0])
+    model, _ = choose(Model((12.0, 60.0)), lambda m: held_out_errors(views, start, lights, tie, patches, rotations, Law(()), 0.0, m)[0])
     assert (len(model.sharpness) > 0) == glossy

@@ -85,7 +85,7 @@ def seen() -> Seen:
 
 
 def test_shadows_tell_how_strongly_walls_light_each_other(seen: Seen) -> None:
-    told = bounce_in_shadow(seen.samples, seen.vertices, seen.grey, replace(DIFFUSE, bounce=0.3))
+    told = bounce_in_shadow(seen.samples, seen.vertices, seen.grey, replace(DIFFUSE, bounce=0.3), 0.0)
     assert told is not None and abs(told / BOUNCE - 1) < 0.05
 
 
@@ -95,7 +95,7 @@ def test_two_fifths_of_the_shadows_that_are_lit_do_not_change_that(seen: Seen) -
         replace(s, image=torch.where(torch.rand(s.image.shape, generator=g) < 0.4, s.image.new_tensor(ALBEDO), s.image))
         for s in seen.samples
     ]
-    told = bounce_in_shadow(wrong, seen.vertices, seen.grey, DIFFUSE)
+    told = bounce_in_shadow(wrong, seen.vertices, seen.grey, DIFFUSE, 0.0)
     assert told is not None and abs(told / BOUNCE - 1) < 0.25
 
 
@@ -103,7 +103,7 @@ def test_two_fifths_of_the_shadows_that_are_lit_do_not_change_that(seen: Seen) -
 def test_the_photographs_unit_is_of_no_account(seen: Seen, unit: float) -> None:
     other = [replace(s, image=unit * s.image, gathered=None if s.gathered is None else unit * s.gathered) for s in seen.samples]
     vertices = replace(seen.vertices, reflectance=unit * seen.vertices.reflectance)
-    told = bounce_in_shadow(other, vertices, seen.grey, DIFFUSE)
+    told = bounce_in_shadow(other, vertices, seen.grey, DIFFUSE, 0.0)
     assert told is not None and abs(unit * told / BOUNCE - 1) < 0.05
 
 
@@ -111,7 +111,22 @@ def test_without_shadows_nothing_is_told(seen: Seen) -> None:
     few = [replace(s, dark=None if s.dark is None else s.dark & (torch.arange(len(s.dark))[:, None] < 2)) for s in seen.samples]
     none = [replace(s, dark=None) for s in seen.samples]
     for views in (few, none):
-        assert bounce_in_shadow(views, seen.vertices, seen.grey, DIFFUSE) is None
+        assert bounce_in_shadow(views, seen.vertices, seen.grey, DIFFUSE, 0.0) is None
+
+
+def test_noise_that_is_never_below_zero_is_no_light_of_other_surfaces(seen: Seen) -> None:
+    g, sigma = torch.Generator().manual_seed(2), 0.15
+    level = float(torch.cat([s.image[s.data] for s in seen.samples]).square().mean().sqrt())
+    # Between four pixels.
+    noise = [torch.randn(4, *s.image.shape, generator=g).clamp_min(0).mean(0) * sigma * level for s in seen.samples]
+    noisy = [replace(s, image=torch.where(s.data, s.image, added)) for s, added in zip(seen.samples, noise, strict=True)]
+    taken = bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, 0.0)
+    left = bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, sigma)
+    assert taken is not None and ALBEDO * taken > 0.25
+    assert left is None
+    noisy = [replace(s, image=s.image + added) for s, added in zip(seen.samples, noise, strict=True)]
+    told = bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, 0.5 * sigma)
+    assert told is not None and ALBEDO * abs(told - BOUNCE) < 0.2
 
 
 def drawn(seen: Seen) -> tuple[Patches, list[ViewSamples], Vertices, Anchor, list[torch.Tensor]]:
@@ -129,27 +144,29 @@ def test_errors_of_what_is_worked_out_to_arrive_do_not_make_the_strength_smaller
     for s in seen.samples:
         assert s.gathered is not None
         off.append(replace(s, gathered=s.gathered * torch.exp(0.4 * torch.randn(s.gathered.shape, generator=g))))
-    told = bounce_in_shadow(off, seen.vertices, seen.grey, DIFFUSE)
+    told = bounce_in_shadow(off, seen.vertices, seen.grey, DIFFUSE, 0.0)
     assert told is not None and abs(told / BOUNCE - 1) < 0.05
-    best = bounce_in_shadow(off, seen.vertices, seen.grey, DIFFUSE, times=0)
+    best = bounce_in_shadow(off, seen.vertices, seen.grey, DIFFUSE, 0.0, times=0)
     assert best is not None and best / BOUNCE == pytest.approx(np.exp(-(0.4**2)), abs=0.05)
 
 
 def test_the_lights_take_the_strength_from_the_shadows_and_stay(seen: Seen) -> None:
     patches, few, part, tie, rotations = drawn(seen)
-    law, free = told_by_shadows(seen.samples, seen.vertices, seen.grey, DIFFUSE, (True, True, False))
+    law, free = told_by_shadows(seen.samples, seen.vertices, seen.grey, DIFFUSE, (True, True, False), 0.0)
     assert abs(law.bounce / BOUNCE - 1) < 0.05 and free == (True, False, False)
     lights, stepped = light_step(few, part, seen.grey, law, tie, patches, rotations, False, True, free)
     assert stepped.bounce == law.bounce
     turned = [torch.rad2deg(torch.arccos((a.direction * b.direction).sum(1).clamp(-1, 1))) for a, b in zip(lights, seen.grey, strict=True)]
     assert float(torch.cat(turned).max()) < 0.5
     for left in ((True, False, False), (True, True, True)):
-        assert told_by_shadows(seen.samples, seen.vertices, seen.grey, DIFFUSE, left) == (DIFFUSE, left)
+        assert told_by_shadows(seen.samples, seen.vertices, seen.grey, DIFFUSE, left, 0.0) == (DIFFUSE, left)
 
 
 def test_inter_reflection_is_kept_where_shadows_hold_light(seen: Seen) -> None:
     patches, few, part, tie, rotations = drawn(seen)
-    errors = [held_out_errors(few, part, seen.grey, tie, patches, rotations, DIFFUSE, Model(bounce=bounce)) for bounce in (False, True)]
+    errors = [
+        held_out_errors(few, part, seen.grey, tie, patches, rotations, DIFFUSE, 0.0, Model(bounce=bounce)) for bounce in (False, True)
+    ]
     (_, dark), (_, told) = errors
     assert np.nanmedian(dark) == 1 and np.nanmedian(told) < 0.1
     assert presumed("inter-reflection", *(np.stack(of_both) for of_both in errors)).kept

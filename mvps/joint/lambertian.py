@@ -30,7 +30,7 @@ def lambertian(capture: Capture, lights: Lights, surface: Surface, device: torch
     # No sample is an outlier before the first residuals are known.
     vertices = Vertices(normal, albedo[:, None], albedo.median().expand(len(albedo)))
     vertices = vertex_steps(views, vertices, grey, law, free_reflectance(normal, HELD, 1), STEPS)
-    state = State(surface, lights, (), law, Model(), vertices, views=views)
+    state = State(surface, lights, (), law, Model(), 0.0, vertices, views=views)
     observed = Observed(capture, surface, views, vertices, grey, law)
     coloured, _ = colours(observed, [channel_ratio(e) for e in lights.intensity], False)
     return material_of(state, coloured)

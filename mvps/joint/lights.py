@@ -233,12 +233,12 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
 
 
 def told_by_shadows(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, free: OfLaw, times: int = TIMES
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, free: OfLaw, noise: float, times: int = TIMES
 ) -> tuple[Law, OfLaw]:
-    """The law with the bounce that shadows alone tell (shadowed.py, times too), and what is left free of it; as they were where lobes take
-    part, and where shadows are too few."""
+    """The law with the bounce that shadows alone tell (shadowed.py, noise and times too), and what is left free of it; as they were
+    where lobes take part, and where shadows are too few."""
     _, bounce, gleam = free
-    told = bounce_in_shadow(views, vertices, lights, law, times) if bounce and not gleam else None
+    told = bounce_in_shadow(views, vertices, lights, law, noise, times) if bounce and not gleam else None
     if told is None:
         return law, free
     return _bounded(law, law.grazing, told, law.gleam, vertices), (free[0], False, False)

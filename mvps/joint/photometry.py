@@ -52,14 +52,16 @@ common (patches.py); ties of single normals hold lights to the mesh's errors."""
 
 @dataclass
 class State:
-    """What one round hands to the next. under: the photographs, perhaps thinned, that `views` are samples of, and their lights; lobed:
-    whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and with them, once asked for."""
+    """What one round hands to the next. noise: of pixels (noise.py); under: the photographs, perhaps thinned, that `views` are samples
+    of, and their lights; lobed: whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and
+    with them, once asked for."""
 
     surface: Surface
     lights: Lights
     maps: tuple[NormalMap, ...]
     law: Law
     model: Model
+    noise: float
     vertices: Vertices | None = None
     gathers: dict[bool, Gather] = field(default_factory=dict)
     lobed: bool = False
@@ -156,7 +158,9 @@ def _errors(
     patches = patches.first(int(more * TRIAL_VERTICES) // VERTICES_OF_PATCH)
     few, part, tie = subset(few, start, anchor, patches.vertex)
     rotations = [_tensor(view.camera.rotation, patches.vertex.device) for view in capture.views]
-    return partial(held_out_errors, few, part, grey_lights(state.lights, patches.vertex.device), tie, patches, rotations, state.law)
+    return partial(
+        held_out_errors, few, part, grey_lights(state.lights, patches.vertex.device), tie, patches, rotations, state.law, state.noise
+    )
 
 
 def _count_lobes(
@@ -233,12 +237,12 @@ def _with_bounce(state: State, vertices: Vertices, lights: list[DirectionalLight
     """The state's law with the bounce that shadows tell, the vertices with it, and what of the law is left to solve."""
     unknown = (state.model.grazing, state.model.bounce, state.lobed)
     # Of all vertices: few of those drawn for the lights lie deep in shadow.
-    law, left = told_by_shadows(state.views, vertices, lights, state.law, unknown)
+    law, left = told_by_shadows(state.views, vertices, lights, state.law, unknown, state.noise)
     if left == unknown:
         return vertices, unknown
     # Albedo that was solved without what arrives from other surfaces is too large, and the bounce too small for it.
     vertices = vertex_step(state.views, vertices, lights, law, free, stated=False)
-    state.law, left = told_by_shadows(state.views, vertices, lights, law, unknown)
+    state.law, left = told_by_shadows(state.views, vertices, lights, law, unknown, state.noise)
     return vertices, left
 
 

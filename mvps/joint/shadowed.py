@@ -13,6 +13,9 @@ well than I, and they favour samples whose x is too large: with errors of a fact
 (regression dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is
 beyond twice what b predicts, the less it counts.
 
+Pixels are never below zero, so that samples, interpolated between them, hold 0.4 of the noise's standard deviation where nothing
+arrives. Only those with x / albedo over BEYOND_NOISE of them count, in which that is taken for a fifth of what returns all light at most.
+
 Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/method.md).
 """
 
@@ -35,6 +38,9 @@ FAR = 2.0
 """Times what b predicts, beyond which a sample counts less: as far as what arrives is worked out wrongly on a mesh on its way
 (docs/method.md)."""
 
+BEYOND_NOISE = 3.0
+"""Standard deviations of the noise: the mean of noise that is never below zero, 0.4 of one, is small against that (docs/method.md)."""
+
 TIMES = 3
 """That weights are renewed: from weights x on, with errors of a factor 1.5, the fourth renewal changes b by less than a per cent."""
 
@@ -52,19 +58,21 @@ def in_shadow(samples: ViewSamples) -> ViewSamples:
 
 
 def bounce_in_shadow(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, times: int = TIMES
+    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, noise: float, times: int = TIMES
 ) -> float | None:
     """The bounce that shadows tell; None where too few do. A median of ratios I / x, counted in steps: samples are too many to be kept.
 
+    noise: standard deviation of a pixel's over the root mean square of samples in the light (noise.py).
     times: that weights are renewed; 0 leaves weights x, with which b, too small, predicts samples best (least absolute errors).
     """
     sending = vertices.reflectance[:, 0]
     albedo = float(sending[sending > 0].median()) if bool((sending > 0).any()) else 1.0
+    least = BEYOND_NOISE * noise * _level(views) * albedo
     told, count = vertices.reflectance.new_zeros(2 * OCTAVES * STEPS, dtype=torch.float64), 0
     for batch in batches([in_shadow(samples) for samples in views], lights):
         index = batch.vertex
         shaded = evaluate(vertices.normal[index], vertices.reflectance[index], batch.towards, batch.lights, law, batch.gathered)
-        some = (batch.weight > 0) & (shaded.indirect > 0)
+        some = (batch.weight > 0) & (shaded.indirect > least)
         sent = shaded.indirect[some].double()
         octave = (batch.image[some] * albedo / sent).log2().clamp(-OCTAVES, OCTAVES).nan_to_num(-OCTAVES)
         step = ((octave + OCTAVES) * STEPS).long().clamp_max(len(told) - 1)
@@ -78,6 +86,12 @@ def bounce_in_shadow(
         # Weights x min(r, (FAR b)^2 / r), r the ratio.
         bounce = _middle(ratio, told * torch.minimum(ratio, (FAR * bounce) ** 2 / ratio))
     return bounce / albedo
+
+
+def _level(views: list[ViewSamples]) -> float:
+    """Root mean square of the samples in the light."""
+    squares = sum(float(samples.image.square()[samples.data].sum(dtype=torch.float64)) for samples in views)
+    return float((squares / max(sum(int(samples.data.sum()) for samples in views), 1)) ** 0.5)
 
 
 def _middle(ordered: Tensor, weight: Tensor) -> float:

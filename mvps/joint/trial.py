@@ -44,12 +44,13 @@ def held_out_errors(
     patches: Patches,
     rotations: list[Tensor],
     law: Law,
+    noise: float,
     model: Model,
 ) -> tuple[Float, Float]:
     """(V,) mean absolute error of a vertex's held-out samples over their mean value, and (V,) of those deep in shadow; NaN without any.
 
     start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope. law: its
-    lobes' kind; the model says the rest.
+    lobes' kind; the model says the rest. noise: of pixels (noise.py).
     """
     fitted, kept = parted(views)
     unknowns = 1 + len(model.sharpness)
@@ -62,7 +63,7 @@ def held_out_errors(
     law_free = (model.grazing, model.bounce, model.gleam)
     for _ in range(LAW_STEPS if any(law_free) else 0):
         # What is judged is how well samples are predicted.
-        law, left = told_by_shadows(fitted, state, lights, law, law_free, times=0)
+        law, left = told_by_shadows(fitted, state, lights, law, law_free, noise, times=0)
         _, law = light_step(fitted, state, lights, law, free, patches, rotations, False, False, left)
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)

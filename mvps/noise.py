@@ -1,0 +1,44 @@
+"""The noise of photographs, from themselves.
+
+Noise is estimated from second differences of the photographs along rows (a smooth surface has hardly any: Immerkaer 1996),
+sigma = median |I(x - 1) - 2 I(x) + I(x + 1)| / (0.6745 sqrt(6)); vertices interpolate between four pixels, which leaves two thirds of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvps.cores import on_cores
+from mvps.scene import Capture, View
+
+INTERPOLATED = 2 / 3
+"""Part of the pixels' noise that is left between four of them, root mean square over all places."""
+
+LIGHTS_ASKED = 4
+"""Photographs of each view from which its noise is estimated."""
+
+
+def noise_share(capture: Capture) -> float:
+    """Standard deviation of the grey photographs' noise over the root mean square of their signal; median over photographs."""
+
+    def of_view(view: View) -> list[float]:
+        shares = []
+        for k in range(0, len(view.lights), max(1, len(view.lights) // LIGHTS_ASKED)):
+            if not view.usable([k]).any():
+                continue
+            image = np.full(view.mask.shape, np.nan)
+            image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
+            second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
+            second = second[np.isfinite(second)]
+            level = np.sqrt(np.nanmean(image**2))
+            if len(second) and level > 0:
+                shares.append(float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6)) / level))
+        return shares
+
+    found = [share for shares in on_cores(of_view, capture.views) for share in shares]
+    return float(np.median(found)) if found else 0.0
+
+
+def samples_noise(capture: Capture) -> float:
+    """`noise_share` of vertices' samples, which are interpolated between pixels."""
+    return INTERPOLATED * noise_share(capture)
