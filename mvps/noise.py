@@ -14,12 +14,26 @@ from mvps.scene import Capture, View
 INTERPOLATED = 2 / 3
 """Part of the pixels' noise that is left between four of them, root mean square over all places."""
 
+DARK = 0.1
+"""Of the pixels, those where a photograph is darkest: most objects have more in shadow."""
+
 LIGHTS_ASKED = 4
 """Photographs of each view from which its noise is estimated."""
 
 
 def noise_share(capture: Capture) -> float:
     """Standard deviation of the grey photographs' noise over the root mean square of their signal; median over photographs."""
+    return _share(capture, 1.0)
+
+
+def dark_noise_share(capture: Capture) -> float:
+    """The same of the darkest pixels, DARK of each photograph: where hardly any light arrives noise is weaker, and without what of it
+    would be below zero."""
+    return _share(capture, DARK)
+
+
+def _share(capture: Capture, part: float) -> float:
+    """The same of the darkest `part` of each photograph's pixels."""
 
     def of_view(view: View) -> list[float]:
         shares = []
@@ -29,9 +43,12 @@ def noise_share(capture: Capture) -> float:
             image = np.full(view.mask.shape, np.nan)
             image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
             second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
-            second = second[np.isfinite(second)]
+            around = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
+            known = np.isfinite(second)
+            second, around = second[known], around[known]
             level = np.sqrt(np.nanmean(image**2))
             if len(second) and level > 0:
+                second = second[around <= np.quantile(around, part)]
                 shares.append(float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6)) / level))
         return shares
 

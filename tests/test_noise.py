@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sphere_scene import SphereScene, make_sphere
 
-from mvps.noise import noise_share
+from mvps.noise import dark_noise_share, noise_share
 from mvps.scene import Capture
 
 
@@ -30,3 +30,19 @@ def test_noise_is_estimated_from_the_photographs(scene: SphereScene, noise: floa
     views, sigmas = zip(*map(noisy, scene.capture.views), strict=True)
     shares = [s / np.sqrt((v.samples[:, k].mean(1) ** 2).mean()) for v, s in zip(views, sigmas, strict=True) for k in (0, 5)]
     assert noise_share(Capture("noisy", views)) == pytest.approx(float(np.median(shares)), rel=0.2)
+
+
+def test_dark_pixels_have_their_own_noise(scene: SphereScene) -> None:
+    rng = np.random.default_rng(0)
+
+    def noisy(view):  # type: ignore[no-untyped-def]
+        # Five times as much in the light, half of the sphere dark.
+        dark = view.pixels[:, 1] < np.median(view.pixels[:, 1])
+        level, sigma = np.where(dark, 0.0, 20000.0), np.where(dark, 100.0, 500.0) * np.sqrt(3)
+        added = rng.normal(0, 1, view.samples.shape) * sigma[:, None, None]
+        return replace(view, samples=np.clip(level[:, None, None] + added, 0, 65534).astype(np.uint16))
+
+    capture = Capture("noisy", tuple(noisy(view) for view in scene.capture.views))
+    level = 20000 * np.sqrt(0.5)
+    # Where it is dark the half below zero is missing, and the darkest differ least.
+    assert 20 < dark_noise_share(capture) * level < 100 < noise_share(capture) * level

@@ -22,7 +22,12 @@ from mvps.motions import UNKNOWNS, Object, with_motions
 from mvps.scene import Capture, Float
 
 FRAME_PIXELS = 1.0
-"""Median motion of the cameras from which the frame of the world is in doubt, and with it distances to anything else in that frame."""
+"""Mean distance of a surface from where it is, along its normals, from which the frame of the world is in doubt, and with it distances to
+anything else in that frame: as much as makes a result useless otherwise (mvps/verdict.py)."""
+
+ALONG_NORMALS = np.sqrt(3 / 2) / 2
+"""Of a motion that photographs show as one: they show two of its three coordinates, and a closed surface moves along its normals by half
+of a motion in the mean."""
 
 DOUBTFUL_PIXELS = 2 * MASK_NOISE
 """Mean of the positive misses from which what cameras do not mend is in doubt: a miss has the noise of two views' masks, and is the largest
@@ -56,7 +61,7 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
     if factors:
         text += f" and lowers the error of held-out lights by {100 * (1 - np.prod(factors)):.0f} % beyond what silhouettes do"
     findings = [Finding("pose", "all views", text, True)]
-    if np.median(shift) > FRAME_PIXELS:
+    if ALONG_NORMALS * np.median(shift) > FRAME_PIXELS:
         words = "where the object lies and how large it is are known no better than the cameras were"
         text = f"{words} ({np.median(shift):.1f} px): no photograph shows a motion or a scale of the whole world"
         findings.append(Finding("pose", "all views", text, False))

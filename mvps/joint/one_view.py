@@ -20,7 +20,7 @@ from mvps.joint.bas_relief import bas_relief, relief_variance, turned
 from mvps.joint.photometry import State, Task, photometric_round
 from mvps.joint.refine import Refined, RefineSettings, finished
 from mvps.mesh import edges, lengths, neighbour_sums
-from mvps.noise import noise_share
+from mvps.noise import dark_noise_share
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, less_confident
 
 ROUNDS = {"draft": 1, "standard": 3, "fine": 5}
@@ -70,7 +70,7 @@ def refine_view(
             lights, maps = _without_relief(capture, lights, maps, law if state is None else state.law, generator, device)
         surface = integrated(maps.normal, maps.confidence)
         if state is None:
-            state = State(surface, lights, (maps,), law, model, noise_share(capture))
+            state = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
         state.surface, state.lights, state.maps, state.gathers = surface, lights, (maps,), {}
         task = Task(settings.free_lights, False, False, False, False, device)
         changes = photometric_round(state, capture, task, carried, generator)

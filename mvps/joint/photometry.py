@@ -52,7 +52,7 @@ common (patches.py); ties of single normals hold lights to the mesh's errors."""
 
 @dataclass
 class State:
-    """What one round hands to the next. noise: of pixels (noise.py); under: the photographs, perhaps thinned, that `views` are samples
+    """What one round hands to the next. noise: of dark pixels (noise.py); under: the photographs, perhaps thinned, that `views` are samples
     of, and their lights; lobed: whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and
     with them, once asked for."""
 

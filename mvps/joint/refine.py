@@ -45,7 +45,7 @@ from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
 from mvps.memory import room_for
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
-from mvps.noise import noise_share
+from mvps.noise import dark_noise_share
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 from mvps.silhouette import mask_distances
 
@@ -206,7 +206,7 @@ def refine(
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     pixel = surface_pixel(capture, surface)
-    state = State(surface, lights, maps, law, settings.model, noise_share(capture))
+    state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture))
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
     repeats = 0

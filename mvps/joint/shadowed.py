@@ -13,8 +13,8 @@ well than I, and they favour samples whose x is too large: with errors of a fact
 (regression dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is
 beyond twice what b predicts, the less it counts.
 
-Pixels are never below zero, so that samples, interpolated between them, hold 0.4 of the noise's standard deviation where nothing
-arrives. Only those with x / albedo over BEYOND_NOISE of them count, in which that is taken for a fifth of what returns all light at most.
+Pixels are never below zero, so that samples, interpolated between them, hold some of their noise where nothing arrives. Only those with
+x / albedo over BEYOND_NOISE standard deviations of it count, in which that is a small part of what returns all light.
 
 Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/method.md).
 """
@@ -39,7 +39,8 @@ FAR = 2.0
 (docs/method.md)."""
 
 BEYOND_NOISE = 3.0
-"""Standard deviations of the noise: the mean of noise that is never below zero, 0.4 of one, is small against that (docs/method.md)."""
+"""Standard deviations of dark pixels' noise (noise.py): of noise without what is below zero, of which 0.58 is left, with a mean of 0.4 of
+what there was (docs/method.md)."""
 
 TIMES = 3
 """That weights are renewed: from weights x on, with errors of a factor 1.5, the fourth renewal changes b by less than a per cent."""
@@ -62,7 +63,7 @@ def bounce_in_shadow(
 ) -> float | None:
     """The bounce that shadows tell; None where too few do. A median of ratios I / x, counted in steps: samples are too many to be kept.
 
-    noise: standard deviation of a pixel's over the root mean square of samples in the light (noise.py).
+    noise: standard deviation of dark pixels' over the root mean square of samples in the light (noise.py).
     times: that weights are renewed; 0 leaves weights x, with which b, too small, predicts samples best (least absolute errors).
     """
     sending = vertices.reflectance[:, 0]

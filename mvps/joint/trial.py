@@ -47,10 +47,11 @@ def held_out_errors(
     noise: float,
     model: Model,
 ) -> tuple[Float, Float]:
-    """(V,) mean absolute error of a vertex's held-out samples over their mean value, and (V,) of those deep in shadow; NaN without any.
+    """(V,) mean absolute error of a vertex's held-out samples over their mean value, NaN without any, and (V,) of a patch's samples deep in
+    shadow, NaN behind the last: what arrives at neighbours is worked out on the same parts of the mesh, and wrong together.
 
     start: normals and grey albedo to begin with; its lobes are not used. anchor ties the normals, patches keep their mean slope. law: its
-    lobes' kind; the model says the rest. noise: of pixels (noise.py).
+    lobes' kind; the model says the rest. noise: of dark pixels (noise.py).
     """
     fitted, kept = parted(views)
     unknowns = 1 + len(model.sharpness)
@@ -68,11 +69,23 @@ def held_out_errors(
         for _ in range(2):
             state = vertex_step(fitted, state, lights, law, free, patches=patches)
     shadowed = [in_shadow(samples) for samples in kept]
-    return _errors(kept, state, lights, law, True), _errors(shadowed, state, lights, law, False)
+    return _errors(kept, state, lights, law), _of_patches(shadowed, state, lights, law, patches)
 
 
-def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, lit: bool) -> Float:
-    """(V,) mean absolute error over the samples' mean value, NaN for a vertex without any; not lit: they hold what surfaces send alone."""
+def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law) -> Float:
+    """(V,) mean absolute error over the samples' mean value, NaN for a vertex without any."""
+    return _share(*_summed(views, state, lights, law, True))
+
+
+def _of_patches(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, patches: Patches) -> Float:
+    """(V,) the same of patches, of samples that hold what surfaces send alone; NaN behind the last patch."""
+    shares = np.full(len(state.scale), np.nan)
+    shares[: patches.count] = _share(*(patches.summed(values) for values in _summed(views, state, lights, law, False)))
+    return shares
+
+
+def _summed(views: list[ViewSamples], state: Vertices, lights: list[DirectionalLights], law: Law, lit: bool) -> tuple[Tensor, Tensor]:
+    """(V,) sums of absolute errors and of samples; not lit: these hold what surfaces send alone."""
     error, level = torch.zeros_like(state.scale), torch.zeros_like(state.scale)
     for batch in batches(views, lights):
         index = batch.vertex
@@ -80,5 +93,10 @@ def _errors(views: list[ViewSamples], state: Vertices, lights: list[DirectionalL
         predicted = shaded.predicted if lit else shaded.rest
         batch.added(error, (batch.weight * (predicted - batch.image).abs()).sum(-1))
         batch.added(level, (batch.weight * batch.image).sum(-1))
+    return error, level
+
+
+def _share(error: Tensor, level: Tensor) -> Float:
+    """Errors over levels, both (n,); NaN where there is no level."""
     ratio = (error / level).double().cpu().numpy()
     return np.where(level.cpu().numpy() > 0, ratio, np.nan)
