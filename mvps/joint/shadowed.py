@@ -13,8 +13,9 @@ well than I, and they favour samples whose x is too large: with errors of a fact
 (regression dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is
 beyond twice what b predicts, the less it counts.
 
-Pixels are never below zero, so that samples, interpolated between them, hold some of their noise where nothing arrives. Only those with
-x / albedo over BEYOND_NOISE standard deviations of it count, in which that is a small part of what returns all light.
+Pixels are never below zero, so that samples, interpolated between them, hold some of their noise where nothing arrives. Samples with
+x / albedo over BEYOND_NOISE standard deviations of it would hardly be misled, but are those whose x came out too large, and tell too
+small a b: so all samples tell it, unless it is over FAR times what those do.
 
 Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/method.md).
 """
@@ -35,8 +36,8 @@ LEAST_SAMPLES = 100
 which so many know to 10 %."""
 
 FAR = 2.0
-"""Times what b predicts, beyond which a sample counts less: as far as what arrives is worked out wrongly on a mesh on its way
-(docs/method.md)."""
+"""Times what b predicts, beyond which a sample counts less, and times what samples beyond the noise say, beyond which all of them are not
+believed: as far as what arrives is worked out wrongly on a mesh on its way (docs/method.md)."""
 
 BEYOND_NOISE = 3.0
 """Standard deviations of dark pixels' noise (noise.py): of noise without what is below zero, of which 0.58 is left, with a mean of 0.4 of
@@ -61,7 +62,8 @@ def in_shadow(samples: ViewSamples) -> ViewSamples:
 def bounce_in_shadow(
     views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, noise: float, times: int = TIMES
 ) -> float | None:
-    """The bounce that shadows tell; None where too few do. A median of ratios I / x, counted in steps: samples are too many to be kept.
+    """The bounce that shadows tell; None where too few beyond the noise do. A median of ratios I / x, counted in steps:
+    samples are too many to be kept.
 
     noise: standard deviation of dark pixels' over the root mean square of samples in the light (noise.py).
     times: that weights are renewed; 0 leaves weights x, with which b, too small, predicts samples best (least absolute errors).
@@ -69,29 +71,37 @@ def bounce_in_shadow(
     sending = vertices.reflectance[:, 0]
     albedo = float(sending[sending > 0].median()) if bool((sending > 0).any()) else 1.0
     least = BEYOND_NOISE * noise * _level(views) * albedo
-    told, count = vertices.reflectance.new_zeros(2 * OCTAVES * STEPS, dtype=torch.float64), 0
+    of_all, of_sure, count = *vertices.reflectance.new_zeros(2, 2 * OCTAVES * STEPS, dtype=torch.float64), 0
     for batch in batches([in_shadow(samples) for samples in views], lights):
         index = batch.vertex
         shaded = evaluate(vertices.normal[index], vertices.reflectance[index], batch.towards, batch.lights, law, batch.gathered)
-        some = (batch.weight > 0) & (shaded.indirect > least)
+        some = (batch.weight > 0) & (shaded.indirect > 0)
         sent = shaded.indirect[some].double()
         octave = (batch.image[some] * albedo / sent).log2().clamp(-OCTAVES, OCTAVES).nan_to_num(-OCTAVES)
-        step = ((octave + OCTAVES) * STEPS).long().clamp_max(len(told) - 1)
-        told.index_add_(0, step, batch.weight[some].double() * sent)
-        count += len(sent)
+        step, share = ((octave + OCTAVES) * STEPS).long().clamp_max(len(of_all) - 1), batch.weight[some].double() * sent
+        sure = sent > least
+        of_all.index_add_(0, step, share)
+        of_sure.index_add_(0, step[sure], share[sure])
+        count += int(sure.sum())
     if count < LEAST_SAMPLES:
         return None
+    by_all, by_sure = _strength(of_all, times), _strength(of_sure, times)
+    return (by_all if by_all <= FAR * by_sure else by_sure) / albedo
+
+
+def _strength(told: Tensor, times: int) -> float:
+    """b over the albedo from weights x, counted by ratios I / x, after so many renewals."""
     ratio = 2 ** ((torch.arange(len(told), device=told.device) + 0.5) / STEPS - OCTAVES).double()
     bounce = _middle(ratio, told)
     for _ in range(times):
         # Weights x min(r, (FAR b)^2 / r), r the ratio.
         bounce = _middle(ratio, told * torch.minimum(ratio, (FAR * bounce) ** 2 / ratio))
-    return bounce / albedo
+    return bounce
 
 
 def _level(views: list[ViewSamples]) -> float:
     """Root mean square of the samples in the light."""
-    squares = sum(float(samples.image.square()[samples.data].sum(dtype=torch.float64)) for samples in views)
+    squares = sum(float(torch.where(samples.data, samples.image, 0).square().sum(dtype=torch.float64)) for samples in views)
     return float((squares / max(sum(int(samples.data.sum()) for samples in views), 1)) ** 0.5)
 
 
