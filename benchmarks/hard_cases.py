@@ -57,12 +57,18 @@ def photographed_outside(sample: Sample, given: Path) -> None:
             cv2.imwrite(str(path), image)
 
 
-def measured(sample: Sample, folder: Path, preset: str, limit: float = 900.0) -> Row:
-    """Figures, status, what the program said, seconds and peak memory of one case; its files in `folder`."""
+def write(sample: Sample, folder: Path) -> None:
+    """The captures of a case, in place of all that `folder` had."""
+    shutil.rmtree(folder, ignore_errors=True)
+    write_capture(sample.given, sample.truth, folder / "given")
+    write_capture(sample.good, sample.truth, folder / "good")
+    photographed_outside(sample, folder / "given")
+
+
+def measured(folder: Path, preset: str, limit: float = 900.0) -> Row:
+    """Figures, status, what the program said, seconds and peak memory of the case in `folder`, and its result there."""
     given, good, result = folder / "given", folder / "good", folder / "result"
-    write_capture(sample.given, sample.truth, given)
-    write_capture(sample.good, sample.truth, good)
-    photographed_outside(sample, given)
+    shutil.rmtree(result, ignore_errors=True)
     command = [sys.executable, "-m", "mvps.reconstruct", str(given), "--out", str(result), "--preset", preset, "--device", "cpu", "--quiet"]
     found = ran(command, limit)
     row: Row = {"seconds": found.seconds, "processor_seconds": found.processor_seconds}
@@ -158,12 +164,13 @@ def keep(record: dict[str, Any], preset: str) -> None:
         PAGE.write_text(page(record), encoding="utf-8")
 
 
-def run_one(name: str, sample: Sample, preset: str, limit: float, kept: Path | None) -> Row:
-    """One case in a folder of its own; what cannot be made or written says so in its row."""
+def run_one(name: str, sample: Sample | None, preset: str, limit: float, kept: Path | None) -> Row:
+    """One case in a folder of its own; sample: None for the captures that `kept` has of it."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = (kept or Path(scratch)) / name
-        shutil.rmtree(folder, ignore_errors=True)
-        row = {"case": name, "machine": machine("cpu")} | measured(sample, folder, preset, limit)
+        if sample is not None:
+            write(sample, folder)
+        row = {"case": name, "machine": machine("cpu")} | measured(folder, preset, limit)
     print(
         f"{name}: {row['status']}, {row['processor_seconds']:.0f} s", *(f"{row[k]:.2f}" for _, k, _, _ in FIGURES if k in row), flush=True
     )

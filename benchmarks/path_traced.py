@@ -4,7 +4,7 @@
 
 Cases are those of CASES, all of them if none is named. Each is made (benchmarks/hard/traced.py), reconstructed and evaluated through the
 command line. Writes path_traced.json and path_traced.md beside this file, after every case; cases of earlier runs stay. --keep DIR keeps
-DIR/CASE/given and DIR/CASE/result. Needs pip install mvps[mitsuba].
+DIR/CASE/given, good and result; captures that are there are not made again. Needs pip install mvps[mitsuba].
 """
 
 from __future__ import annotations
@@ -78,7 +78,8 @@ def main() -> None:
     before = json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"] if stem.with_suffix(".json").exists() else []
     found = {row["case"]: row for row in before}
     for name in given.cases or CASES:
-        found[name] = run_one(name, made(CASES[name]), given.preset, given.limit, given.keep)
+        there = given.keep is not None and (given.keep / name / "good").exists()
+        found[name] = run_one(name, None if there else made(CASES[name]), given.preset, given.limit, given.keep)
         rows = [found[name] for name in CASES if name in found]
         stem.with_suffix(".json").write_text(json.dumps({"rows": rows}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
         command = f"python {Path(sys.argv[0]).parent.name}/path_traced.py --preset {given.preset}"
