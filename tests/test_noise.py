@@ -9,7 +9,7 @@ import pytest
 from sphere_scene import SphereScene, make_sphere
 
 from mvps.noise import dark_noise_share, noise_share
-from mvps.scene import Capture
+from mvps.scene import Capture, View
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +32,22 @@ def test_noise_is_estimated_from_the_photographs(scene: SphereScene, noise: floa
     assert noise_share(Capture("noisy", views)) == pytest.approx(float(np.median(shares)), rel=0.2)
 
 
-def test_dark_pixels_have_their_own_noise(scene: SphereScene) -> None:
+def dim_below(scene: SphereScene, level: float) -> Capture:
+    """Upper halves of the masks at this level with noise of 100, lower ones at 20000 with noise of 500, in grey."""
     rng = np.random.default_rng(0)
 
-    def noisy(view):  # type: ignore[no-untyped-def]
-        # Five times as much in the light, half of the sphere dark.
-        dark = view.pixels[:, 1] < np.median(view.pixels[:, 1])
-        level, sigma = np.where(dark, 0.0, 20000.0), np.where(dark, 100.0, 500.0) * np.sqrt(3)
-        added = rng.normal(0, 1, view.samples.shape) * sigma[:, None, None]
-        return replace(view, samples=np.clip(level[:, None, None] + added, 0, 65534).astype(np.uint16))
+    def of_view(view: View) -> View:
+        dim = view.pixels[:, 1] < np.median(view.pixels[:, 1])
+        values = rng.normal(0, 1, view.samples.shape) * np.where(dim, 100, 500)[:, None, None] * np.sqrt(3)
+        return replace(view, samples=np.clip(values + np.where(dim, level, 20000)[:, None, None], 0, 65534).astype(np.uint16))
 
-    capture = Capture("noisy", tuple(noisy(view) for view in scene.capture.views))
-    level = 20000 * np.sqrt(0.5)
-    # Where it is dark the half below zero is missing, and the darkest differ least.
-    assert 20 < dark_noise_share(capture) * level < 100 < noise_share(capture) * level
+    return Capture("dim", tuple(of_view(view) for view in scene.capture.views))
+
+
+def test_dark_pixels_have_their_own_noise(scene: SphereScene) -> None:
+    assert dark_noise_share(dim_below(scene, 2000)) * 20000 * np.sqrt(0.5) == pytest.approx(100, rel=0.2)
+
+
+def test_of_noise_at_zero_less_than_half_is_left(scene: SphereScene) -> None:
+    # 0.58 of it without what would be below zero, and the darkest pixels are those that differ least.
+    assert 20 < dark_noise_share(dim_below(scene, 0)) * 20000 * np.sqrt(0.5) < 58

@@ -114,19 +114,42 @@ def test_without_shadows_nothing_is_told(seen: Seen) -> None:
         assert bounce_in_shadow(views, seen.vertices, seen.grey, DIFFUSE, 0.0) is None
 
 
-def test_noise_that_is_never_below_zero_is_no_light_of_other_surfaces(seen: Seen) -> None:
-    g, sigma = torch.Generator().manual_seed(2), 0.15
+def with_noise(seen: Seen, samples: list[ViewSamples], sigma: float, lit_within: bool) -> list[ViewSamples]:
+    """The samples in shadow with noise of sigma times the level in the light, never below zero in any of the four pixels of each;
+    lit_within: added to what walls send each other, in place of it otherwise."""
+    g = torch.Generator().manual_seed(2)
     level = float(torch.cat([s.image[s.data] for s in seen.samples]).square().mean().sqrt())
-    # Between four pixels.
-    noise = [torch.randn(4, *s.image.shape, generator=g).clamp_min(0).mean(0) * sigma * level for s in seen.samples]
-    noisy = [replace(s, image=torch.where(s.data, s.image, added)) for s, added in zip(seen.samples, noise, strict=True)]
+    noise = [torch.randn(4, *s.image.shape, generator=g).clamp_min(0).mean(0) * sigma * level for s in samples]
+    return [replace(s, image=torch.where(s.data, s.image, lit_within * s.image + added)) for s, added in zip(samples, noise, strict=True)]
+
+
+def test_where_all_shadows_are_within_the_noise_nothing_is_told(seen: Seen) -> None:
+    noisy = with_noise(seen, seen.samples, 0.15, False)
     taken = bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, 0.0)
-    left = bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, sigma)
     assert taken is not None and ALBEDO * taken > 0.25
-    assert left is None
-    noisy = [replace(s, image=s.image + added) for s, added in zip(seen.samples, noise, strict=True)]
-    told = bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, 0.5 * sigma)
-    assert told is not None and ALBEDO * abs(told - BOUNCE) < 0.2
+    assert bounce_in_shadow(noisy, seen.vertices, seen.grey, DIFFUSE, 0.15) is None
+
+
+def test_noise_that_is_never_below_zero_is_no_light_of_other_surfaces(seen: Seen) -> None:
+    # Nine tenths of the vertices receive a tenth of what the others do.
+    g = torch.Generator().manual_seed(3)
+    dim = [torch.where(torch.rand(len(s.vertex), generator=g) < 0.9, 0.1, 1.0) for s in seen.samples]
+    samples = [
+        replace(
+            s,
+            image=torch.where(s.data, s.image, d[:, None] * s.image),
+            gathered=None if s.gathered is None else d[:, None, None] * s.gathered,
+        )
+        for s, d in zip(seen.samples, dim, strict=True)
+    ]
+    dark = with_noise(seen, samples, 0.04, False)
+    taken, told = (bounce_in_shadow(dark, seen.vertices, seen.grey, DIFFUSE, noise) for noise in (0.0, 0.04))
+    assert taken is not None and ALBEDO * taken > 0.4
+    assert told is not None and ALBEDO * told < 0.1
+    # With light between the walls both agree within a factor of two, and all samples tell it.
+    lit = with_noise(seen, samples, 0.04, True)
+    by_all, told = (bounce_in_shadow(lit, seen.vertices, seen.grey, DIFFUSE, noise) for noise in (0.0, 0.04))
+    assert told is not None and told == by_all and abs(told / BOUNCE - 1) < 0.35
 
 
 def drawn(seen: Seen) -> tuple[Patches, list[ViewSamples], Vertices, Anchor, list[torch.Tensor]]:
