@@ -29,13 +29,14 @@ interpolates to 12 %, of an effect of some per cent."""
 
 LIFT_EDGES = 0.01
 """Height at which these rays start, over the mean of the mesh's edges. What a point has beside it is mostly lit where it is itself, so that
-from a fifth of an edge's height on a hollow's lit side lacked 2.5 % and its dark side had 5 % too much (docs/method.md)."""
+from a fifth of an edge's height on a hollow's lit side lacked 2.5 % and its dark side had 5 % too much (docs/findings/shadows.md)."""
 
 BOUNCES = 3
 """What is left after three is below r^4 of the occluded part: 0.1 % for a white bowl, nothing elsewhere."""
 
 PATCH_EDGES = 3.0
-"""Size of a patch over the mesh's edges: some eight vertices; with 5 narrow hollows share a patch with their rims (docs/method.md)."""
+"""Size of a patch over the mesh's edges: some eight vertices; with 5 narrow hollows share a patch with their rims
+(docs/findings/reflectance.md)."""
 
 PATCHES_AT_ONCE = 4096
 """Whose rays are traced together: half a million."""

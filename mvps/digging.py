@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 WORTHWHILE = 0.9
 """Of the mean share that was unexplained, what is left at most where hollows that were dug stay. Another coarse round alone leaves 0.9 to
-0.96 of it (docs/method.md)."""
+0.96 of it (docs/findings/hollows.md)."""
 
 DEPTHS = (1.0, 0.5)
 """Of pits, over the width of the patch: half as deep where as deep as wide is not better."""
 
 HIDDEN = 0.2
 """Mean depth, pixels, of the hollows that may be hidden where nothing fits (hollows.py) from which they are dug for. Seven captures without
-hollows that Stage I leaves are at 0.02 to 0.1, a vessel and a bowl at 1.2 and 1.4 (docs/method.md)."""
+hollows that Stage I leaves are at 0.02 to 0.1, a vessel and a bowl at 1.2 and 1.4 (docs/findings/hollows.md)."""
 
 PITS = 0.01
-"""Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/method.md)."""
+"""Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/findings/hollows.md)."""
 
 HALVED = 0.5
 """Of the misfit of pits, what is left at most where they stay. 0.19 to 0.40 was left of what hid a hollow, 0.58 and more of what did not or
-of a deeper one, and 0.64 to 1.0 by a round without digging (docs/method.md)."""
+of a deeper one, and 0.64 to 1.0 by a round without digging (docs/findings/hollows.md)."""
 
 MOST_TURNS = 6
 """As long as it helps, each of them."""

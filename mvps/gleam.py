@@ -37,11 +37,12 @@ from mvps.shading import PARALLEL, gain_of, lobe_of, returned
 
 LEAST_SHARE = 0.25
 """Of the light that the median point returns, what lobes must return to be counted: as much as a patch errs in what it gathers
-(bounce.RAYS). It lies in the gap between glossy paint and plastic, 5 to 20 %, and metals and half-bare ones, 45 to 90 (docs/method.md)."""
+(bounce.RAYS). It lies in the gap between glossy paint and plastic, 5 to 20 %, and metals and half-bare ones, 45 to 90
+(docs/findings/reflectance.md)."""
 
 LOBES_PATCH_EDGES = 1.0
 """Size of a patch over the mesh's edges where lobes take part: about a vertex. Between the folds of a copper statue patches of 3, 1.5 and 1
-edges leave 41, 29 and 26 % of what surfaces send unexplained (docs/method.md)."""
+edges leave 41, 29 and 26 % of what surfaces send unexplained (docs/findings/reflectance.md)."""
 
 SAMPLES_PER_CHUNK = 1 << 19
 """Rays times lights at once."""

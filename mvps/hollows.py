@@ -35,7 +35,7 @@ from mvps.visibility import ray_caster
 MISFIT = 0.2
 """Share of its signal that a vertex leaves unexplained from which it lies on no surface, or on one that the model does not know: twice what
 makes a model a bad one for a whole object. From 0.1 on digging goes into what merely fits badly, from 0.3 on it comes to rest early
-(docs/method.md)."""
+(docs/findings/hollows.md)."""
 
 EXACT_CELLS = 3
 """From the surface; farther off distances count cells."""

@@ -15,7 +15,7 @@ from mvps.scene import Law
 
 STILL_PIXELS = 0.1
 """Mean move of the vertices in a coarse round above which it is done again: bunny's move by 0.36 and 0.09, in five views by 0.46, 0.29
-and 0.11, and what is left in the end is half or two thirds of what it is after one round (docs/method.md)."""
+and 0.11, and what is left in the end is half or two thirds of what it is after one round (docs/findings/stage_one.md)."""
 
 
 @dataclass(frozen=True)

@@ -32,15 +32,15 @@ from torch import Tensor
 from mvps.scene import Float, Law
 
 GRAZING_POWER = 3
-"""Of (1 - cosine) in the diffuse term's grazing factor. Measured falloffs of two materials ask for 3 and 4 (docs/method.md); Schlick's
-dielectrics have 5."""
+"""Of (1 - cosine) in the diffuse term's grazing factor. Measured falloffs of two materials ask for 3 and 4; Schlick's dielectrics have
+5 (docs/findings/reflectance.md)."""
 
 QUADRATURE = 64
 """Nodes of Gauss and Legendre: enough for sharpness up to 10^4."""
 
 FAINTEST = -30.0
 """Least logarithm of a Gaussian lobe's value: 1e-13 of its peak no photograph shows, and the value's square is still a normal number in
-float32. Below that processors take ten times as long over every product (docs/method.md)."""
+float32. Below that processors take ten times as long over every product (docs/findings/cost.md)."""
 
 PARALLEL = 1e-6
 """Floor of 2 + 2 v.l: view and light exactly opposite have no half vector (and such a point is never lit and seen)."""
@@ -48,7 +48,7 @@ PARALLEL = 1e-6
 
 STEEPEST = 4.0
 """Largest gain, with light and view 120 degrees apart: beyond, masking takes over. The light between a copper object's walls is predicted
-alike with 4, 16 and 100 (docs/method.md)."""
+alike with 4, 16 and 100 (docs/findings/reflectance.md)."""
 
 
 def half_length(v_dot_l: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ RAYS_PER_CALL = 1 << 18
 
 OFFSET_EDGES = 0.2
 """Height at which rays leave the mesh, over the mean of its edges e. Facets stand off a sphere of radius R by e^2 / 8 R, which is less down
-to R = 0.6 e. From a whole edge's height shadows would begin two edges late under a light at 27 degrees (docs/method.md)."""
+to R = 0.6 e. From a whole edge's height shadows would begin two edges late under a light at 27 degrees (docs/findings/shadows.md)."""
 
 
 class Hits(NamedTuple):

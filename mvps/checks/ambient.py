@@ -44,7 +44,7 @@ LOW = 0.1
 """Quantile of the shadowed samples."""
 
 LEAST = 0.01
-"""Of a, in bright levels: lights then are off by a third of a degree (docs/method.md), as much as by all else."""
+"""Of a, in bright levels: lights then are off by a third of a degree (docs/findings/checks.md), as much as by all else."""
 
 FEWEST_SHADOWS, FEWEST_OF_LIGHT = 50, 10
 """Shadowed samples of a view, and of a light, below which they say nothing."""

@@ -23,7 +23,7 @@ from mvps.photometric import normal_maps
 from mvps.scene import Capture, Law
 
 TURNS = 2
-"""Of the quick reconstruction and the cameras: what is left after two is within what photographs tell (docs/method.md)."""
+"""Of the quick reconstruction and the cameras: what is left after two is within what photographs tell (docs/findings/checks.md)."""
 
 ROUNDS = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.5, 2.0, 0.4))
 """Of the quick reconstruction: those of the preset `draft`."""

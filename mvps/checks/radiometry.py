@@ -46,7 +46,8 @@ CURVES: Mapping[str, Curve] = MappingProxyType(
 """Those of displays and of files for them."""
 
 BETTER = 1.25
-"""Factor of rho: the variance falls by a third. On linear captures undoing a curve makes rho 1.3 to 8 times as large (docs/method.md)."""
+"""Factor of rho: the variance falls by a third. On linear captures undoing a curve makes rho 1.3 to 8 times as large
+(docs/findings/checks.md)."""
 
 FEWEST_LIGHTS = 8
 """Of a view: six of them lit leave three residuals a pixel."""

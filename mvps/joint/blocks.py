@@ -40,7 +40,8 @@ WORKERS = 2
 """Parts that the views are dealt into: fixed, because the order of a sum is part of its value. Two is what a laptop's cores keep busy."""
 
 LOBES_ERROR = 1.0
-"""Of light that lobes send, over that light: a wall whose normal is off by a lobe's width sends all of it elsewhere (docs/method.md)."""
+"""Of light that lobes send, over that light: a wall whose normal is off by a lobe's width sends all of it elsewhere
+(docs/findings/reflectance.md)."""
 
 
 @dataclass

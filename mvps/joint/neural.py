@@ -52,7 +52,7 @@ EM_STEPS, FIRST_DEVIATION = 6, 0.5
 """Of the population of z; its deviation at first, as a change of the prediction."""
 
 WIDTH, STEPS, BATCH, RATE = 24, 600, 1 << 13, 1e-2
-"""Two hidden layers; of Adam, the rate falling as a cosine. Twice the width predicted no better (docs/method.md)."""
+"""Two hidden layers; of Adam, the rate falling as a cosine. Twice the width predicted no better (docs/findings/reflectance.md)."""
 
 KNEE = 0.3
 """Between the absolute error, by which it is judged, and the square, which a rendered image shows."""
@@ -202,7 +202,8 @@ def _errors(table: _Table, predicted: Tensor, vertices: int) -> Float:
 
 def neural_residual(of: Observed, relative: Tensor, poor: float, generator: np.random.Generator) -> tuple[Trial, Residual | None]:
     """The trial of the residual on the vertices whose relative residual (V,), NaN without samples, is above `poor`, and the residual itself
-    where it is kept. None is tried where the median is not above `poor`: there views held out gained nothing (docs/method.md)."""
+    where it is kept. None is tried where the median is not above `poor`: there views held out gained nothing
+    (docs/findings/reflectance.md)."""
     start = time.perf_counter()
     bad = torch.nonzero(relative > poor)[:, 0]
     if not float(relative.nanmedian()) > poor or len(bad) < LEAST_VERTICES:

@@ -31,7 +31,8 @@ from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, ray_caster, shade_of, visible_vertices
 
 SAMPLES_PER_CHUNK = 1 << 17
-"""Samples handled at once: smaller chunks wait for the interpreter, larger ones leave the processor's last cache (docs/method.md)."""
+"""Samples handled at once: smaller chunks wait for the interpreter, larger ones leave the processor's last cache
+(docs/findings/cost.md)."""
 
 SAMPLES_PER_LAUNCH = 1 << 21
 """The same on a GPU: to read and write so many at 1 to 4 TB/s takes about as long as to start an operation, 5 to 10 us."""

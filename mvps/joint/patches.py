@@ -31,7 +31,7 @@ from solvers.least_squares import columns_of_inverse
 
 VERTICES_OF_PATCH = 25
 """Five by five. Patches of 12: lights follow the mesh's errors again; of 49 and 200: nothing more is gained, and thin parts have none with
-one side (docs/method.md)."""
+one side (docs/findings/lights.md)."""
 
 SAME_SIDE = 0.3
 """Least cosine between the normals of a patch: a thin part has two sides, and slopes end at 90 degrees."""

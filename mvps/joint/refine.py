@@ -61,7 +61,7 @@ STILL = 0.5
 
 MOSTLY = 0.6
 """Part of a mesh's edges that creases split, above which the object has more detail than the mesh: halves of these are split once more.
-Four captures lie at 0.38 to 0.46 and 0.69 to 0.74 (docs/method.md)."""
+Four captures lie at 0.38 to 0.46 and 0.69 to 0.74 (docs/findings/vertices.md)."""
 
 
 MOST_REPEATS = 2

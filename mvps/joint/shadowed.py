@@ -17,7 +17,7 @@ Pixels are never below zero, so that samples, interpolated between them, hold so
 x / albedo over BEYOND_NOISE standard deviations of it would hardly be misled, but are those whose x came out too large, and tell too
 small a b: so all samples tell it, unless it is over FAR times what those do.
 
-Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/method.md).
+Where lobes take part (gleam.py) two strengths would have to be told apart, which shadows cannot (docs/findings/shadows.md).
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from mvps.joint.observe import ViewSamples
 from mvps.scene import Law
 
 LEAST_SAMPLES = 100
-"""Where there are fewer, samples in the light have their say: single ones are off by as much as the strength itself (docs/method.md),
-which so many know to 10 %."""
+"""Where there are fewer, samples in the light have their say: single ones are off by as much as the strength itself, which so many
+know to 10 % (docs/findings/shadows.md)."""
 
 FAR = 2.0
 """Times what b predicts, beyond which a sample counts less, and times what samples beyond the noise say, beyond which all of them are not
-believed: as far as what arrives is worked out wrongly on a mesh on its way (docs/method.md)."""
+believed: as far as what arrives is worked out wrongly on a mesh on its way (docs/findings/shadows.md)."""
 
 BEYOND_NOISE = 3.0
 """Standard deviations of dark pixels' noise (noise.py): of noise without what is below zero, of which 0.58 is left, with a mean of 0.4 of
-what there was (docs/method.md)."""
+what there was (docs/findings/shadows.md)."""
 
 TIMES = 3
 """That weights are renewed: from weights x on, with errors of a factor 1.5, the fourth renewal changes b by less than a per cent."""

@@ -29,7 +29,7 @@ PIXEL_BLUR = 1 / 12 + 1 / 6
 
 SHARPENING = 2.0
 """Over the first order of undoing a pixel's blur: views lie on each other with errors of some tenths of a pixel, which blurs what they say
-together once more. Chosen among 1, 2 and 3 (docs/method.md)."""
+together once more. Chosen among 1, 2 and 3 (docs/findings/edges.md)."""
 
 MOST_GAIN = 8.0
 """Of the difference: what faces of a third of a pixel take. A face with hardly any area around would take any."""

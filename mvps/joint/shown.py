@@ -23,7 +23,7 @@ from mvps.mesh import edges, neighbour_sums, normalise, vertex_normals
 from mvps.scene import Float, Material, Surface
 
 SURFACE_SHARE = 2.0
-"""Of the surface's normal over the vertex's own: on seven results 3 was as good, on eighteen 1 was worse (docs/method.md)."""
+"""Of the surface's normal over the vertex's own: on seven results 3 was as good, on eighteen 1 was worse (docs/findings/edges.md)."""
 
 
 def own_normals(normal: Float, noise: Float, of: Observed) -> Float:

@@ -20,7 +20,7 @@ the surface is smooth. Of each tangential component
 
 where the tie to the mesh stands in where samples say little. A vertex has few clusters, so its figures are averaged with its neighbours'.
 No constant is fitted to true normals; that noise stays in both sums, and the last term's form, were chosen with true normals in view
-(docs/method.md).
+(docs/findings/normals.md).
 """
 
 from __future__ import annotations
