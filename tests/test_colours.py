@@ -11,8 +11,8 @@ from sphere_scene import make_sphere
 
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours, lobes_in_colour
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import channel_ratio, observe
-from mvps.joint.photometry import grey_lights
 from mvps.joint.reflectance import Observed
 
 CPU = torch.device("cpu")

@@ -23,11 +23,11 @@ from mvps.command import run
 from mvps.device import chosen_device
 from mvps.hull import default_cells, signed_distance
 from mvps.joint.blocks import Vertices, evaluate, vertex_equations
+from mvps.joint.grey import grey_lights
 from mvps.joint.held_out import fit_lights
 from mvps.joint.lights import light_step
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import ViewSamples, observe
-from mvps.joint.photometry import grey_lights
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.refine import Refined, RefineSettings, RoundSettings, refine
 from mvps.joint.reflectance import Observed

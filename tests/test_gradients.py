@@ -20,8 +20,8 @@ from mvps.joint.blocks import (
     vertex_derivatives,
     vertex_equations,
 )
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import ViewSamples, observe
-from mvps.joint.photometry import grey_lights
 from mvps.scene import Law, Surface
 from solvers.low_rank import CAUCHY_95
 

@@ -17,12 +17,15 @@ from sphere_scene import RADIUS, SphereScene, make_sphere
 from mvps.joint import vertices
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, tangents, vertex_equations
+from mvps.joint.choosing import TRIAL_VERTICES, errors_of
+from mvps.joint.grey import grey_lights
+from mvps.joint.lighting import LIGHT_VERTICES, of_one_normal
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import SHADOW_MARGIN, ViewSamples, observe
 from mvps.joint.patches import drawn_patches
-from mvps.joint.photometry import LIGHT_VERTICES, TRIAL_VERTICES, State, _errors, grey_lights, of_one_normal
 from mvps.joint.pixels import _beside, all_pixel_normals, filled
 from mvps.joint.reflectance import Observed
+from mvps.joint.state import State
 from mvps.joint.stated import stated_errors
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
@@ -361,9 +364,9 @@ def test_of_few_photographs_more_vertices_try_the_models_components(
 ) -> None:
     views, start, _, law = problem(scene)
     photographs, surface = sum(samples.image.shape[1] for samples in views), scene.reconstruction.surface
-    monkeypatch.setattr("mvps.joint.photometry.ENOUGH_PHOTOGRAPHS", fewer * photographs)
+    monkeypatch.setattr("mvps.joint.choosing.ENOUGH_PHOTOGRAPHS", fewer * photographs)
     seen = torch.cat([samples.vertex for samples in views]).unique().numpy()
     patches = drawn_patches(seen, surface, start.normal.numpy(), LIGHT_VERTICES, np.random.default_rng(0), CPU)
     state = State(surface, scene.reconstruction.lights, (), law, Model(), 0.0)
-    lit, _ = _errors(state, scene.capture, views, start, free_reflectance(start.normal, 1.0, 2), patches)(Model())
+    lit, _ = errors_of(state, scene.capture, views, start, free_reflectance(start.normal, 1.0, 2), patches)(Model())
     assert len(lit) == pytest.approx(min(fewer * TRIAL_VERTICES, len(patches.vertex)), rel=0.1)

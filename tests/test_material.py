@@ -11,8 +11,8 @@ from references import in_patches
 from sphere_scene import SphereScene, make_sphere
 
 from mvps.joint.blocks import Vertices
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import observe
-from mvps.joint.photometry import grey_lights
 from mvps.joint.steps import free_reflectance
 from mvps.joint.trial import held_out_errors
 from mvps.material import SHARPENED, Model, choose, judged, presumed

@@ -12,9 +12,9 @@ from sphere_scene import SphereScene, make_sphere
 
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.joint.blocks import Vertices, evaluate
+from mvps.joint.grey import grey_lights
 from mvps.joint.neural import LEAST_VERTICES, neural_residual
 from mvps.joint.observe import observe
-from mvps.joint.photometry import grey_lights
 from mvps.joint.reflectance import Observed
 from mvps.mesh import normalise
 from mvps.neural import MOMENTS, inputs, log_factor, moments

@@ -13,9 +13,9 @@ from sphere_scene import RADIUS, make_sphere
 from mvps.camera import pixel_footprint
 from mvps.joint.agreement import Agreement
 from mvps.joint.blocks import Vertices
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import observe
 from mvps.joint.photoconsistency import photoconsistency, shown_in
-from mvps.joint.photometry import grey_lights
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.reflectance import Observed
 from mvps.photometric import normal_maps

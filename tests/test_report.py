@@ -15,7 +15,7 @@ import pytest
 from sphere_scene import SphereScene, make_sphere
 
 import mvps.report.page
-from mvps.joint import neural, photometry
+from mvps.joint import choosing, neural
 from mvps.rendering import RAYS_ACROSS
 from mvps.report import report_html, write_report
 from mvps.report.charts import light_sphere, line_chart, pair_chart
@@ -234,7 +234,7 @@ def test_sentences_have_room_on_a_phone() -> None:
 
 def test_reasons_for_no_trial_are_told_apart_from_names() -> None:
     """The page knows them by how they are written."""
-    assert NOT_TRIED in neural.NOT_TRIED and NOT_TRIED in Path(str(photometry.__file__)).read_text(encoding="utf-8")
+    assert NOT_TRIED in neural.NOT_TRIED and NOT_TRIED in Path(str(choosing.__file__)).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("missing", SECTIONS)

@@ -11,10 +11,10 @@ import trimesh
 
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.grey import grey_lights
 from mvps.joint.lights import light_step, subset, told_by_shadows
 from mvps.joint.observe import ViewSamples, observe, with_gathered
 from mvps.joint.patches import Patches, drawn_patches
-from mvps.joint.photometry import grey_lights
 from mvps.joint.shadowed import bounce_in_shadow
 from mvps.joint.steps import Anchor, free_reflectance
 from mvps.joint.trial import held_out_errors

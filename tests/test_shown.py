@@ -10,8 +10,8 @@ import torch
 from sphere_scene import SphereScene, make_sphere
 
 from mvps.joint.blocks import Vertices
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import observe
-from mvps.joint.photometry import grey_lights
 from mvps.joint.reflectance import Observed
 from mvps.joint.shown import SURFACE_SHARE, own_normals, shaded_as
 from mvps.mesh import angles_deg, edges, neighbour_sums, normalise, vertex_normals

@@ -11,8 +11,8 @@ import torch
 from sphere_scene import SphereScene, make_sphere
 
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import ViewSamples, observe
-from mvps.joint.photometry import grey_lights
 from mvps.joint.reflectance import Observed
 from mvps.joint.stated import icosahedron, stated_errors
 from mvps.joint.steps import free_reflectance, vertex_steps

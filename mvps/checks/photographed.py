@@ -14,7 +14,7 @@ from mvps.calibrate import MINIMUM_LIGHTS, uncalibrated_lights
 from mvps.device import Device, chosen_device
 from mvps.hull import default_cells, signed_distance, visual_hull
 from mvps.joint.bundle import Model, aligned, part, prediction_errors, solved
-from mvps.joint.photometry import LIGHT_VERTICES
+from mvps.joint.lighting import LIGHT_VERTICES
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
 from mvps.joint.thinned import ENOUGH_LIGHTS, thinned
 from mvps.material import CERTAIN, LARGEST, gained

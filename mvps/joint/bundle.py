@@ -22,8 +22,9 @@ from scipy.spatial import cKDTree
 
 from mvps.camera import bilinear, pixel_footprint, project
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, robust, tangents, vertex_derivatives
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import ViewSamples, grey_radiance, observe
-from mvps.joint.photometry import WEAK_TIE, grey_lights
+from mvps.joint.photometry import WEAK_TIE
 from mvps.joint.steps import CORRELATED, free_reflectance, vertex_steps
 from mvps.mesh import vertex_normals
 from mvps.motions import UNKNOWNS, Object, derivatives, gauge, image_derivatives, with_motions, without_gauge

@@ -9,9 +9,10 @@ import torch
 
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import colours
+from mvps.joint.grey import grey_lights
 from mvps.joint.observe import channel_ratio, observe
-from mvps.joint.photometry import State, grey_lights, material_of
 from mvps.joint.reflectance import Observed
+from mvps.joint.state import State, material_of
 from mvps.joint.steps import free_reflectance, lambert_albedo, vertex_steps
 from mvps.material import Model
 from mvps.mesh import vertex_normals

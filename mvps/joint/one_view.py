@@ -17,8 +17,9 @@ import numpy as np
 import torch
 
 from mvps.joint.bas_relief import bas_relief, relief_variance, turned
-from mvps.joint.photometry import State, Task, photometric_round
+from mvps.joint.photometry import Task, photometric_round
 from mvps.joint.refine import Refined, RefineSettings, finished
+from mvps.joint.state import State
 from mvps.mesh import edges, lengths, neighbour_sums
 from mvps.noise import dark_noise_share
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, less_confident

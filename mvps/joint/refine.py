@@ -18,27 +18,20 @@ from mvps.camera import surface_pixel
 from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
+from mvps.joint.choosing import TRIAL_VERTICES
 from mvps.joint.colours import colours, lobes_in_colour
 from mvps.joint.detail import detailed, interpolated
 from mvps.joint.fused import face_targets
+from mvps.joint.grey import grey_lights
+from mvps.joint.lighting import drawn
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
 from mvps.joint.photoconsistency import photoconsistency, shown_in
-from mvps.joint.photometry import (
-    TRIAL_VERTICES,
-    WEAK_TIE,
-    State,
-    Task,
-    drawn,
-    grey_albedo,
-    grey_lights,
-    material_of,
-    photometric_round,
-    relative_residuals,
-)
+from mvps.joint.photometry import WEAK_TIE, Task, photometric_round
 from mvps.joint.pixels import few_lights
 from mvps.joint.reflectance import Observed
 from mvps.joint.shown import own_normals, shaded_as
+from mvps.joint.state import State, grey_albedo, material_of, relative_residuals
 from mvps.joint.stated import stated_errors
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks

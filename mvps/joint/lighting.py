@@ -1,0 +1,107 @@
+"""A round's lights and law: solved on the vertices of some patches (lights.py), and what shadows tell of the law (shadowed.py)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from mvps.camera import surface_pixel
+from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.grey import coloured_lights, grey_lights, tensor32
+from mvps.joint.lights import OfLaw, light_step, subset, told_by_shadows, with_mean_one
+from mvps.joint.observe import ViewSamples, channel_ratio
+from mvps.joint.patches import Patches
+from mvps.joint.reflectance import Observed, light_ratios
+from mvps.joint.state import State
+from mvps.joint.steps import Anchor, vertex_step
+from mvps.mesh import angles_deg, edges, lengths
+from mvps.scene import Capture, Lights, Surface
+
+LIGHT_VERTICES = 4000
+"""Vertices, in patches, that stand for all when lights are solved."""
+
+LIGHT_STEPS = 3
+"""Gauss-Newton steps a round: near a minimum steps at least halve (refine.py)."""
+
+LIGHT_TIE = 1.0
+"""Standard deviation, radians, of refined normals from the mesh's while lights are solved: as far as a normal may be from another that the
+same camera sees. Patches hold what normals have in common (patches.py); ties of single normals hold lights to the mesh's errors."""
+
+
+def drawn(views: list[ViewSamples], count: int, generator: np.random.Generator) -> torch.Tensor:
+    """Indices of a random part of the vertices that are seen, in order."""
+    seen = torch.cat([samples.vertex for samples in views]).unique()
+    order = generator.permutation(len(seen))[:count]
+    drawn: torch.Tensor = seen[torch.from_numpy(np.sort(order)).to(seen.device)]
+    return drawn
+
+
+def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest: float) -> torch.Tensor:
+    """(V,) how far a pixel at each vertex shows one normal: 1 / (1 + s d^2), where d radians is what normals (V, 3) change by along a pixel
+    and s the sharpness of the object's sharpest lobe, which that spread of normals makes duller by this factor (Toksvig 2005)."""
+    pairs = edges(surface)
+    # Neighbours within half a pixel share their samples: what they differ by is not seen.
+    length = np.maximum(lengths(surface.vertices[pairs[:, 0]] - surface.vertices[pairs[:, 1]]) / pixel, 0.5)
+    ends = torch.from_numpy(pairs).to(normal.device)
+    change = (normal[ends[:, 0]] - normal[ends[:, 1]]).square().sum(1) / tensor32(length, normal.device) ** 2
+    total, count = torch.zeros_like(normal[:, 0]), torch.zeros_like(normal[:, 0])
+    for end in ends.T:
+        total.index_add_(0, end, change)
+        count.index_add_(0, end, torch.ones_like(change))
+    return 1 / (1 + sharpest * (total / count.clamp_min(1)))
+
+
+def solved_lights(
+    state: State,
+    capture: Capture,
+    few: list[ViewSamples],
+    vertices: Vertices,
+    anchor: Anchor,
+    patches: Patches,
+    free_lights: bool,
+    of_law: OfLaw,
+) -> tuple[Lights, float]:
+    """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
+
+    Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
+    """
+    pixel = surface_pixel(capture, state.surface)
+    single = of_one_normal(state.surface, vertices.normal, pixel, max(state.law.sharpness, default=1.0))
+    few = [replace(samples, weight=samples.weight * single[samples.vertex]) for samples in few]
+    few, part, tie = subset(few, vertices, anchor, patches.vertex)
+    rotations = [tensor32(view.camera.rotation, patches.vertex.device) for view in capture.views]
+    lights = grey_lights(state.lights, patches.vertex.device)
+    before = lights
+    for _ in range(LIGHT_STEPS):
+        before = lights
+        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, state.lights.one_rig, free_lights, of_law)
+        lights, part = with_mean_one(lights, part)
+        for _ in range(2):
+            part = vertex_step(few, part, lights, state.law, tie, patches=patches)
+    turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
+    solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
+    return solved, float(np.concatenate(turned).mean())
+
+
+def with_bounce(state: State, vertices: Vertices, lights: list[DirectionalLights], free: Anchor) -> tuple[Vertices, OfLaw]:
+    """The state's law with the bounce that shadows tell, the vertices with it, and what of the law is left to solve."""
+    unknown = (state.model.grazing, state.model.bounce, state.lobed)
+    # Of all vertices: few of those drawn for the lights lie deep in shadow.
+    law, left = told_by_shadows(state.views, vertices, lights, state.law, unknown, state.noise)
+    if left == unknown:
+        return vertices, unknown
+    # Albedo that was solved without what arrives from other surfaces is too large, and the bounce too small for it.
+    vertices = vertex_step(state.views, vertices, lights, law, free, stated=False)
+    state.law, left = told_by_shadows(state.views, vertices, lights, law, unknown, state.noise)
+    return vertices, left
+
+
+def with_colours(state: State, capture: Capture, few: list[ViewSamples], some: torch.Tensor) -> Lights:
+    """The lights with colours from some vertices."""
+    assert state.vertices is not None
+    rows = [samples.of_vertices(some, len(state.vertices.normal)) for samples in few]
+    ratios, grey = [channel_ratio(e) for e in state.lights.intensity], grey_lights(state.lights, some.device)
+    ratios = light_ratios(Observed(capture, state.surface, rows, state.vertices, grey, state.law), ratios, state.lights.one_rig)
+    return coloured_lights(grey, ratios, state.lights.one_rig)
