@@ -9,7 +9,7 @@ has only come nearer, so a segment stops it with
 (occupancy rendering of UNISURF, Oechsle et al. 2021, in the unbiased form of NeuS, Wang et al. 2021: the weight peaks where d = 0 and
 not before it, which is what pulls a plain occupancy's surface inwards). Samples and steps: fieldtraining.py.
 
-Losses (Yang et al. 2022, eq. 3-5), all but the last robust (Geman and McClure 1985), weighted by the normals' confidence:
+Losses (Yang et al. 2022, eq. 3-5), all but the last robust (Geman and McClure 1985), the first two weighted by the normals' confidence:
 
     normal  |n(x) - n_photometric|^2,   n(x) = grad d by finite differences
     colour  |c - (albedo, normal)|^2 rendered against the pixel's photometric stereo, whose agreement between views places the surface
