@@ -208,7 +208,7 @@ def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> tuple[Flo
     )
     # The median albedo is the unit, so that lights of separately solved views share one scale.
     scaled: Float = lights * np.median(albedo * np.concatenate([s.bright for s in samples]))
-    return _without_gaps(scaled), A is None
+    return without_gaps(scaled), A is None
 
 
 def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
@@ -231,7 +231,7 @@ def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
     return albedo, lights
 
 
-def _without_gaps(scaled: Float) -> Float:
+def without_gaps(scaled: Float) -> Float:
     """(lights, 3) in which lights that no sample speaks of stand at the camera, with the median intensity (one where it is none's):
     something finite that nothing weighs."""
     length = np.linalg.norm(scaled, axis=1)
@@ -252,7 +252,7 @@ def _from_normals(sample: _Sampled) -> Float:
         residual = absolute - sample.normal @ lights.T
         weights = robust_weights(residual.T, lit.T, sample.noise * float(np.median(sample.bright)))
         lights = solve_rows(absolute.T, weights, sample.normal)
-    return _without_gaps(lights)
+    return without_gaps(lights)
 
 
 def colour_ratios(view: View) -> Float:

@@ -7,19 +7,20 @@ factorisation -> 3 x 3 ambiguity (relief/ambiguity.py) -> photometric stereo -> 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mvps.finding import Finding
 from mvps.progress import Progress
-from mvps.scene import Capture, CaptureError, Float, Lights, NormalMap, Reconstruction, Surface, View
+from mvps.scene import Capture, CaptureError, Float, Lights, NormalMap, Reconstruction, Surface, View, less_confident
 
 if TYPE_CHECKING:
     from mvps.device import Device
     from mvps.plan import Parts
     from mvps.reconstruct import Settings
+    from mvps.relief.ambiguity import Resolved
 
 WORDS = (
     "One view: the surface is what its normals integrate to, open, of what this camera sees; its distance {distance} and heights of steps"
@@ -66,17 +67,17 @@ def surface_of(view: View, normal: Float, confidence: Float, distance: float) ->
     return pixel_surface(view.camera, view.pixels, local, depth, distance)
 
 
-def lights_of_view(capture: Capture, given: Lights | None, seed: int, progress: Progress) -> Lights:
-    """The given lights, or those of the factorisation with its ambiguity resolved up to what lobes say later."""
-    from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, normalised, solve_ambiguity
-    from mvps.relief.ambiguity import factors, resolved
+def lights_of_view(capture: Capture, given: Lights | None, seed: int, progress: Progress) -> tuple[Lights, Resolved | None]:
+    """The given lights, or those of the factorisation with its ambiguity resolved up to what lobes say later, and what resolved it."""
+    from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, normalised, solve_ambiguity, without_gaps
+    from mvps.relief.ambiguity import Resolved, factors, resolved
     from mvps.relief.silhouette import inflated_normals
 
     view = capture.views[0]
     with progress.stage("lights") as stage:
         if given is not None:
             stage.status("given with the capture")
-            return given
+            return given, None
         if len(view.lights) < MINIMUM_LIGHTS:
             raise CaptureError(
                 f"{capture.name}: wanted at least {MINIMUM_LIGHTS} photographs of the one view to solve its lights, given"
@@ -92,10 +93,11 @@ def lights_of_view(capture: Capture, given: Lights | None, seed: int, progress: 
                 f"{capture.name}: wanted photographs whose lights span three directions, given ones where {error};"
                 " use other lights or --calibrated-lights"
             ) from error
-        scaled = pseudo.right @ np.linalg.inv(A)
+        scaled = without_gaps(pseudo.right @ np.linalg.inv(A))
         strength = np.linalg.norm(scaled, axis=1, keepdims=True)
         stage.status(f"one view; three factors leave {100 * pseudo.residual:.1f} % of the images")
-        return normalised([scaled / strength @ view.camera.rotation], [strength * colour_ratios(view)], True)
+        lights = normalised([scaled / strength @ view.camera.rotation], [strength * colour_ratios(view)], True)
+        return lights, Resolved(pseudo, rough, A)
 
 
 def residuals(view: View, maps: NormalMap, lights: Lights) -> Float:
@@ -135,8 +137,8 @@ def without_misfits(capture: Capture, lights: Lights, device: Device) -> tuple[C
         if worst == dropped:
             break
         dropped = worst
-    with np.errstate(invalid="ignore"):
-        wrong = [n for n, r in zip(view.lights, found, strict=True) if r > max(POOR_FIT, OUTLYING * float(np.nanmedian(found)))]
+    most = max(POOR_FIT, OUTLYING * float(np.median(found[np.isfinite(found)]))) if np.isfinite(found).any() else np.inf
+    wrong = [n for n, r in zip(view.lights, found, strict=True) if r > most]
     words = "fits no surface under its light as the others do; left out"
     return capture.without({view.name: wrong}), [Finding("photograph", f"{view.name}/{n:03d}", words, True) for n in wrong]
 
@@ -153,6 +155,7 @@ def reconstruct_view(
 ) -> Reconstruction:
     """A reconstruction from the only view of `used`; the rest as in reconstruct.reconstruct."""
     from mvps.device import chosen_device
+    from mvps.jackknife import at_corners, shared_variance
     from mvps.joint.one_view import ROUNDS, refine_view
     from mvps.joint.refine import RefineSettings
     from mvps.outcome import all_lights, normal_pictures, told
@@ -160,7 +163,7 @@ def reconstruct_view(
 
     device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
     distance, words = distance_of(view)
-    lights = lights_of_view(used, given, settings.seed, progress)
+    lights, found = lights_of_view(used, given, settings.seed, progress)
     with progress.stage("photometric stereo") as stage:
         used, misfits = without_misfits(used, lights, device)
         maps = normal_maps(used, lights, device)[0]
@@ -175,6 +178,10 @@ def reconstruct_view(
             return surface_of(view, normal, confidence, distance)
 
         refined = refine_view(used, lights, maps, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
+        if found is not None:
+            shared = at_corners(shared_variance(used.views[0], lights, maps, found, parts.law(), settings.seed, device), refined.surface)
+            material = replace(refined.material, confidence=less_confident(refined.material.confidence, shared))
+            refined = replace(refined, material=material)
         stage.status(refined.status)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)

@@ -227,7 +227,7 @@ def test_a_dark_pixel_faces_the_camera_without_confidence(scene: SphereScene) ->
 def test_lights_of_which_nothing_is_known_stand_at_the_camera(nothing: float) -> None:
     """Of a view without a usable sample all are such; no number comes of the others."""
     toward = [0.0, 0.0, -1.0]
-    none = calibrate._without_gaps(np.full((3, 3), nothing))
+    none = calibrate.without_gaps(np.full((3, 3), nothing))
     np.testing.assert_array_equal(none, [toward] * 3)
-    some = calibrate._without_gaps(np.array([[0.0, 2.0, 0.0], [nothing] * 3]))
+    some = calibrate.without_gaps(np.array([[0.0, 2.0, 0.0], [nothing] * 3]))
     np.testing.assert_array_equal(some, [[0, 2, 0], [0, 0, -2]])

@@ -27,7 +27,7 @@ from mvps.joint.pixels import _beside, all_pixel_normals, filled
 from mvps.joint.reflectance import Observed
 from mvps.joint.state import State
 from mvps.joint.stated import stated_errors
-from mvps.joint.steps import free_reflectance, vertex_step
+from mvps.joint.steps import LEAST_NOISE, SCALE_FLOOR, _least_scale, free_reflectance, vertex_step, with_population
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import fuse
 from mvps.material import Model
@@ -370,3 +370,18 @@ def test_of_few_photographs_more_vertices_try_the_models_components(
     state = State(surface, scene.reconstruction.lights, (), law, Model(), 0.0)
     lit, _ = errors_of(state, scene.capture, views, start, free_reflectance(start.normal, 1.0, 2), patches)(Model())
     assert len(lit) == pytest.approx(min(fewer * TRIAL_VERTICES, len(patches.vertex)), rel=0.1)
+
+
+def test_where_nothing_reflects_lobes_are_tied_to_nothing() -> None:
+    """A tie to none with no spread would be infinitely firm, and its equations no numbers."""
+    normal, none = torch.eye(3), torch.zeros(3, 3)
+    black = Vertices(normal, none, torch.ones(3), said=torch.ones(3, 3))
+    assert with_population(black, free_reflectance(normal, 0.3, 3)).reflectance_sigma.isinf().all()
+
+
+@pytest.mark.parametrize("albedo", [[0.0, 0.0, 0.4], [0.0, 0.0, 0.0]])
+def test_exact_fits_on_a_mesh_that_is_mostly_out_of_sight_have_a_scale(albedo: list[float]) -> None:
+    """One light a view: every sample fits, and the median vertex is not seen. One over the scale's square is a float32."""
+    least = _least_scale(torch.zeros(1), torch.tensor(albedo))
+    assert least == pytest.approx(LEAST_NOISE * 0.4 if max(albedo) else SCALE_FLOOR)
+    assert np.isfinite(np.float32(1) / np.float32(least) ** 2)

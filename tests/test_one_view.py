@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from mvps.evaluate import evaluate_result
 from mvps.evaluate import main as evaluate
-from mvps.joint.bas_relief import bas_relief, lean_variance, turned
+from mvps.joint.bas_relief import bas_relief, turned
 from mvps.joint.one_view import with_rim
 from mvps.load import read_capture
-from mvps.mesh import angles_deg, normalise
+from mvps.mesh import angles_deg
 from mvps.oneview import distance_of, without_misfits
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
 from mvps.reconstruct import main as reconstruct_main
 from mvps.scene import Capture, CaptureError, Law, Lights, Surface, Truth, less_confident
+from mvps.sound import sound
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -45,20 +48,6 @@ def test_the_bas_relief_is_found_by_the_lobes(made: tuple[Capture, Truth]) -> No
     straight, _, found, _ = turned(back, bent, shade, light, strength)
     assert angles_deg(found, direction).mean() < 1.5
     assert angles_deg(straight, normal).mean() < 3
-
-
-def test_what_the_bas_relief_does_to_normals() -> None:
-    """Against normals under ten thousand of them."""
-    draw = np.random.default_rng(0)
-    root = 0.02 * draw.normal(size=(3, 3))
-    normal = normalise(np.array([[0.0, 0, 1], [0.5, -0.3, 0.8], [0.9, 0.3, 0.1], [-1, 0, 0]]))
-    one, light = np.ones(len(normal)), np.eye(3)
-    turns = np.zeros((10000, len(normal), 3))
-    for k, x in enumerate(draw.normal(size=(len(turns), 3)) @ root.T):
-        G = np.array([[1, 0, 0], [0, 1, 0], [x[0], x[1], np.exp(x[2])]])
-        turns[k] = turned(G, normal, one, light, np.ones(3))[0] - normal
-    measured = (turns**2).sum(2).mean(0) / 2
-    assert np.allclose(lean_variance(root @ root.T, normal), measured, rtol=0.05, atol=1e-12)
 
 
 def test_black_pixels_have_normals_after_a_bas_relief() -> None:
@@ -122,6 +111,30 @@ def test_photographs_that_fit_no_surface_are_left_out(made: tuple[Capture, Truth
     assert np.flatnonzero(~after.views[0].shown).tolist() == [2, 7, 11]
     few = capture.select({name: capture.views[0].lights[:8]})
     assert without_misfits(few, Lights((direction[:8],), (truth.intensity[name][:8],), True), device) == (few, [])
+
+
+def one_view(mask: np.ndarray, made: tuple[Capture, Truth]) -> Capture:
+    """The made capture, of this mask's pixels alone."""
+    view = made[0].views[0]
+    stay = mask & view.mask
+    return replace(made[0], views=(replace(view, mask=stay, samples=view.samples[stay[view.mask]]),))
+
+
+def test_an_object_of_two_pixels_width_is_refused(made: tuple[Capture, Truth]) -> None:
+    """All pixels lie beside the mask's border."""
+    mask = made[0].views[0].mask
+    ring = mask & ~cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), iterations=2).astype(bool)
+    with pytest.raises(CaptureError, match="a pixel inside of its mask"):
+        reconstruct(one_view(ring, made), Settings("made", preset="draft"), None, Progress())
+
+
+def test_an_object_of_a_few_pixels_has_a_result_that_is_doubted(made: tuple[Capture, Truth]) -> None:
+    """Narrower than photographs are moved by in their check."""
+    view = made[0].views[0]
+    middle = view.pixels.mean(0)
+    near = np.abs(np.indices(view.mask.shape) - middle[:, None, None]).max(0) < 5
+    found = reconstruct(sound(one_view(near, made), Progress())[0], Settings("made", preset="draft"), None, Progress())
+    assert np.isfinite(found.surface.vertices).all() and found.metrics["status"]["name"] != "one view"
 
 
 def test_too_few_photographs_are_refused(captures: Path) -> None:

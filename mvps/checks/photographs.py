@@ -102,7 +102,10 @@ def _fault(p: _Predicted, light: int, spread: float) -> str | None:
 def _unrelated(views: Sequence[_Predicted], same_lights: bool) -> dict[tuple[str, int], str]:
     """What is wrong with single photographs, by view and number of the light."""
     wrong: dict[tuple[str, int], str] = {}
-    spread = float(np.nanmedian(np.concatenate([p.spread for p in views])))
+    spreads = np.concatenate([p.spread for p in views])
+    if not np.isfinite(spreads).any():
+        return wrong
+    spread = float(np.nanmedian(spreads))
     for p, far in zip(views, outliers([p.b for p in views], same_lights), strict=True):
         for light in np.flatnonzero(far):
             fault = _fault(p, int(light), spread)

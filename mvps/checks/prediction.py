@@ -95,6 +95,8 @@ def coefficients(gram: Float, ridge: float) -> Float:
 
 def medians(residual: Float, counted: Bool) -> Any:
     """(lights,) medians of |residual| (n, lights) over the counted, NaN where they are too few."""
+    if not len(residual):
+        return np.full(residual.shape[1], np.nan)
     ordered = np.sort(np.where(counted, np.abs(residual), np.inf).T, axis=1)
     count = counted.sum(0)
     middle = np.take_along_axis(ordered, np.minimum(count // 2, len(residual) - 1)[:, None], 1)[:, 0]

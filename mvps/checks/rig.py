@@ -104,7 +104,9 @@ def rig_faults(views: Sequence[Sampled], residuals: Sequence[Float]) -> tuple[di
     of_others = [_mean(np.delete(grams, i, axis=0)) for i in range(len(views))]
     fits = on_cores(_fit, values, of_others)
     worse = [np.log(np.maximum(fit.left, 1e-12) / np.maximum(own, 1e-12)) for fit, own in zip(fits, residuals, strict=True)]
-    if not np.nanmedian(np.concatenate(worse)) < ONE_RIG:
+    told = np.concatenate(worse)
+    told = told[~np.isnan(told)]
+    if not len(told) or np.median(told) >= ONE_RIG:
         return {}, {}
     back: dict[str, dict[int, int]] = {}
     wrong: dict[tuple[str, int], str] = {}

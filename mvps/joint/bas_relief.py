@@ -10,32 +10,22 @@ pixels p,
 scale_p is what normal and reflectance, solved under these lights with lobes tied to the object's (steps.py), leave of the pixel's
 samples, level_p their root mean square; H is the entropy of the albedos with their chroma, by a kernel of SHADE. Three unknowns without
 derivatives: COBYLA.
-
-How well they are known. Errors of the law are shared by pixels of a region, so that halves across and down the picture, solved apart, give
-x_k = (mu, nu, log lambda) that scatter about their mean with REGIONS times its covariance; and what is still found after the last round, x,
-is contradicted by that round's lights, of which either may be right:
-
-    C = cov x_k / REGIONS + x x^T / 2,    dn = - n_z (1 - n n^T) dx:    sigma^2 = n_z^2 (tr C - n^T C n) / 2
-
-of either tangential component of a normal n, in the frame of G.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import torch
 
 from mvps.camera import pixel_centres, rays
-from mvps.cores import on_cores
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance, interior
 from mvps.joint.pixels import WEIGHT_TIE
 from mvps.joint.steps import CORRELATED, Anchor, free_reflectance, vertex_step, with_population
 from mvps.mesh import lengths, normalise
-from mvps.scene import Camera, Float, Int, Law, View
+from mvps.scene import Bool, Camera, Float, Int, Law, View
 from solvers.bounded import minimise
 
 PIXELS = 800
@@ -47,9 +37,6 @@ SHADE = 0.05
 FREE_STEPS, TIED_STEPS = 2, 3
 LEAN = 0.3
 """Tie of the normals, radians, to where G puts them."""
-
-REGIONS = 4
-"""Of the picture: fewer tell no covariance of three unknowns, more leave too few pixels for one."""
 
 REACH, FIRST_STEP, LAST_STEP, MOST_TRIED = 1.0, 0.15, 0.01, 60
 """Of mu, nu and log lambda: slopes of 45 degrees, reliefs a factor of e apart; a hundredth is half a degree."""
@@ -127,69 +114,31 @@ def _tied(state: Vertices, free: Anchor) -> Anchor:
     return replace(anchor, reflectance_sigma=spread)
 
 
-class _Relief:
-    """Bas-reliefs of a view's normals (pixels, 3), world, grey albedo (pixels,), and lights' directions and intensities (lights, 3)."""
-
-    def __init__(self, view: View, normal: Float, albedo: Float, lights: tuple[Float, Float], law: Law, device: torch.device) -> None:
-        self.view, self.normal, self.albedo, self.law, self.device = view, normal, albedo, law, device
-        self.direction, self.intensity = lights
-        self.frame = _frame(view.camera, view.pixels)
-
-    def matrix(self, x: Float) -> Float:
-        """(3, 3) G, world frame."""
-        G: Float = self.frame.T @ _matrix(x) @ self.frame
-        return G
-
-    def drawn(self, generator: np.random.Generator) -> Int:
-        """(n,) rows of pixels, in order."""
-        known = np.flatnonzero((interior(self.view) > 0) & (self.albedo > 0))
-        return np.sort(generator.permutation(known)[:PIXELS])
-
-    def likeliest(self, rows: Int) -> Float:
-        """(3,) mu, nu, log lambda that fit these pixels best; 0 without any."""
-        if not len(rows):
-            return np.zeros(3)
-        pixels = _Pixels(self.view, channel_ratio(self.intensity), rows, self.law, self.device)
-        normal, albedo, grey = self.normal[rows], self.albedo[rows], self.intensity.mean(1)
-
-        def loss(x: Float) -> float:
-            return pixels.loss(*turned(self.matrix(x), normal, albedo, self.direction, grey))
-
-        far = np.full(3, REACH)
-        return minimise(loss, np.zeros(3), -far, far, FIRST_STEP, LAST_STEP, MOST_TRIED)[0]
-
-
 def bas_relief(
-    view: View, normal: Float, albedo: Float, lights: tuple[Float, Float], law: Law, generator: np.random.Generator, device: torch.device
+    view: View,
+    normal: Float,
+    albedo: Float,
+    lights: tuple[Float, Float],
+    law: Law,
+    generator: np.random.Generator,
+    device: torch.device,
+    among: Bool | None = None,
 ) -> Float:
     """(3, 3) G, world frame, for normals (pixels, 3), world, and grey albedo (pixels,) of the view's foreground, and its lights' directions
-    and intensities (lights, 3)."""
-    relief = _Relief(view, normal, albedo, lights, law, device)
-    return relief.matrix(relief.likeliest(relief.drawn(generator)))
+    and intensities (lights, 3); among (pixels,): those that have a say, all by default. No motion where none has."""
+    frame, (direction, intensity) = _frame(view.camera, view.pixels), lights
+    said = (interior(view) > 0) & (albedo > 0) & (True if among is None else among)
+    rows = np.sort(generator.permutation(np.flatnonzero(said))[:PIXELS])
+    if not len(rows):
+        return np.eye(3)
+    pixels = _Pixels(view, channel_ratio(intensity), rows, law, device)
 
+    def matrix(x: Float) -> Float:
+        G: Float = frame.T @ _matrix(x) @ frame
+        return G
 
-def relief_variance(
-    view: View, normal: Float, albedo: Float, lights: tuple[Float, Float], law: Law, generator: np.random.Generator, device: torch.device
-) -> Callable[[Float], Float]:
-    """What the bas-relief's error does to normals (n, 3), unit, world frame: variance (n,) of either tangential component, radians^2.
-    Arguments as of `bas_relief`, at the end of the last round."""
-    relief = _Relief(view, normal, albedo, lights, law, device)
-    rows = relief.drawn(generator)
-    rest = relief.likeliest(rows)
-    regions = [quarter for half in _halves(rows, view.pixels[rows, 0]) for quarter in _halves(half, view.pixels[half, 1])]
-    found = np.stack(on_cores(relief.likeliest, regions))
-    covariance = np.cov(found.T) / REGIONS + np.outer(rest, rest) / 2
-    return lambda of: lean_variance(covariance, of @ relief.frame.T)
+    def loss(x: Float) -> float:
+        return pixels.loss(*turned(matrix(x), normal[rows], albedo[rows], direction, intensity.mean(1)))
 
-
-def lean_variance(covariance: Float, normal: Float) -> Float:
-    """(n,) variance of either tangential component of unit normals (n, 3), in the frame of G, where (mu, nu, log lambda), of which none is
-    expected, have this covariance (3, 3)."""
-    along = np.einsum("vi,ij,vj->v", normal, covariance, normal)
-    variance: Float = normal[:, 2] ** 2 * (np.trace(covariance) - along) / 2
-    return variance
-
-
-def _halves(rows: Int, place: Int) -> list[Int]:
-    """Rows of the lower and of the upper half of places (n,), each in order."""
-    return [np.sort(half) for half in np.array_split(rows[np.argsort(place, kind="stable")], 2)]
+    far = np.full(3, REACH)
+    return matrix(minimise(loss, np.zeros(3), -far, far, FIRST_STEP, LAST_STEP, MOST_TRIED)[0])

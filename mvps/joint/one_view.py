@@ -16,7 +16,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvps.joint.bas_relief import bas_relief, relief_variance, turned
+from mvps.joint.bas_relief import bas_relief, turned
 from mvps.joint.photometry import Task, photometric_round
 from mvps.joint.refine import Refined, RefineSettings, finished
 from mvps.joint.state import State
@@ -83,7 +83,7 @@ def refine_view(
     assert state is not None
     refined = finished(state, settings, account, generator)
     material = replace(refined.material, confidence=with_rim(refined.material.confidence, state.surface))
-    return replace(refined, material=_leaning(material, capture, state, generator, device) if settings.free_lights else material)
+    return replace(refined, material=_contradicted(material, capture, state, generator, device) if settings.free_lights else material)
 
 
 def with_rim(confidence: Float, surface: Surface) -> Float:
@@ -96,9 +96,13 @@ def with_rim(confidence: Float, surface: Surface) -> Float:
     return np.where(beside, 1 / (1 + total / np.maximum(count, 1)), confidence)
 
 
-def _leaning(material: Material, capture: Capture, state: State, generator: np.random.Generator, device: torch.device) -> Material:
-    """The material, confident no more than the bas-relief is known."""
+def _contradicted(material: Material, capture: Capture, state: State, generator: np.random.Generator, device: torch.device) -> Material:
+    """The material, confident no more than what its normals and those after one more bas-relief contradict each other by, of which either
+    may be right: of the square of their difference half is either's error, and half of that of either tangential component."""
     lights, maps = state.lights, state.maps[0]
-    grey, own = maps.albedo.mean(1).astype(np.float64), (lights.direction[0], lights.intensity[0])
-    variance = relief_variance(capture.views[0], maps.normal.astype(np.float64), grey, own, state.law, generator, device)
-    return replace(material, confidence=less_confident(material.confidence, variance(material.normal)))
+    direction, intensity = lights.direction[0], lights.intensity[0]
+    normal, grey = maps.normal.astype(np.float64), maps.albedo.mean(1).astype(np.float64)
+    G = bas_relief(capture.views[0], normal, grey, (direction, intensity), state.law, generator, device)
+    own = material.normal
+    moved = turned(G, own, np.ones(len(own)), direction, intensity.mean(1))[0]
+    return replace(material, confidence=less_confident(material.confidence, ((moved - own) ** 2).sum(1) / 4))

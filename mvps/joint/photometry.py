@@ -27,7 +27,7 @@ from mvps.joint.state import State, grey_albedo, lit_by, material_of, relative_r
 from mvps.joint.steps import free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.mesh import angles_deg, vertex_normals
-from mvps.scene import Capture, Lights, Surface
+from mvps.scene import Capture, CaptureError, Lights, Surface
 
 MATERIAL_STEPS, CARRIED_STEPS = 3, 2
 
@@ -81,6 +81,11 @@ def photometric_round(
     mesh_normal = vertex_normals(state.surface)
     vertices = _started(state, part, part_lights, mesh_normal, carried, device)
     seen = torch.cat([samples.vertex for samples in state.views]).unique().cpu().numpy()
+    if not len(seen):
+        raise CaptureError(
+            f"{capture.name}: wanted a view that sees the object a pixel inside of its mask, given none; photograph thin objects from"
+            " nearer, and check masks and poses"
+        )
     patches = drawn_patches(seen, state.surface, mesh_normal, LIGHT_VERTICES, generator, device)
     few = state.views
     if part is not capture:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -30,6 +29,9 @@ CORRELATED = 6.0
 LEAST_SCALE = 0.1
 """Smallest scale of a vertex's residuals over the median one: a vertex with few samples may fit them exactly by chance."""
 
+
+SCALE_FLOOR = 1e-10
+"""The same in any case: of a photograph's full scale less than a step of 32 bits, and one over its square is still a float32."""
 
 LEAST_NOISE = 1e-3
 """The same over the median albedo: no sensor is better than 10 bits. Where every vertex has too few samples, all fit exactly."""
@@ -62,6 +64,8 @@ def with_population(vertices: Vertices, anchor: Anchor) -> Anchor:
     sigma = (share * (vertices.reflectance - mean) ** 2).sum(0).sqrt()
     # An object without this lobe shows no spread either; rounding must not turn that into certainty.
     sigma = sigma.clamp_min(1e-3 * float(mean.sum()))
+    # Where nothing reflects anything there is nothing to be tied to.
+    sigma = torch.where(sigma > SCALE_FLOOR, sigma, torch.inf)
     sigma[0] = torch.inf
     like = vertices.reflectance
     return replace(anchor, reflectance=mean.to(like).expand_as(like), reflectance_sigma=sigma.to(like).expand_as(like))
@@ -129,7 +133,11 @@ def vertex_steps(
 def _least_scale(scale: Tensor, albedo: Tensor) -> float:
     """The smallest scale that is believed, for the scales of vertices with samples (n,) and albedo (V,)."""
     middle = float(scale.median()) if len(scale) else 0.0
-    return max(LEAST_SCALE * middle, LEAST_NOISE * float(albedo.median()), float(np.finfo(np.float32).tiny))
+    usual = float(albedo.median())
+    if not usual and bool((albedo > 0).any()):
+        # Most of the mesh is out of sight.
+        usual = float(albedo[albedo > 0].median())
+    return max(LEAST_SCALE * middle, LEAST_NOISE * usual, SCALE_FLOOR)
 
 
 def _sigma(equations: NormalEquations, vertices: Vertices) -> Tensor:

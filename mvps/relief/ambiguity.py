@@ -27,7 +27,7 @@ from scipy.optimize import least_squares
 
 from mvps.camera import pixel_centres
 from mvps.mesh import normalise
-from mvps.scene import Float, Int, View
+from mvps.scene import Bool, Float, Int, View
 from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, robust_weights, solve_rows
 
 PAIRS, BLOCKS, BAND, FACTORED = 4000, 3000, 1000, 4000
@@ -64,6 +64,15 @@ class Pseudo:
     fourth_singular_value: float
 
 
+@dataclass(frozen=True)
+class Resolved:
+    """What resolves a view's factors: pseudo, the factors; rough (pixels, 3) normals of the inflated silhouette; A (3, 3), camera frame."""
+
+    pseudo: Pseudo
+    rough: Float
+    A: Float
+
+
 def factors(view: View, generator: np.random.Generator) -> Pseudo:
     """Robust factorisation of a view's grey photographs: of FACTORED pixels, then of all for these lights."""
     image = view.samples.astype(np.float32).mean(-1).astype(np.float64) * view.scale
@@ -89,23 +98,25 @@ def outer_band(view: View) -> Int:
 
 
 class _Known:
-    """Residuals of what is known of b = A b', for drawn pixels."""
+    """Residuals of what is known of b = A b', for pixels drawn among some (pixels,)."""
 
-    def __init__(self, view: View, pseudo: Pseudo, rough: Float, generator: np.random.Generator) -> None:
+    def __init__(self, view: View, pseudo: Pseudo, rough: Float, generator: np.random.Generator, among: Bool) -> None:
         index = view.pixel_index
         corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], -1).reshape(-1, 4)
-        corners = corners[(corners >= 0).all(1)]
+        corners = corners[((corners >= 0) & among[corners]).all(1)]
         blocks = corners[generator.permutation(len(corners))[:BLOCKS]]
         centres = pixel_centres(view.pixels)
         ray = np.concatenate([centres, np.ones((len(centres), 1))], 1) @ np.linalg.inv(view.camera.K).T
         self.of_blocks, self.rays = pseudo.left[blocks], ray[blocks]
         self.size = np.maximum(np.linalg.norm(self.of_blocks, axis=2).mean(1) ** 2, 1e-300)
-        pairs = generator.integers(0, len(pseudo.left), (2, PAIRS))
+        rows = np.flatnonzero(among)
+        pairs = rows[generator.integers(0, len(rows), (2, PAIRS))]
         self.of_pairs, self.brightness = pseudo.left[pairs], np.log(pseudo.bright[pairs])
         chroma = log_chroma(view)
         apart = ((chroma[pairs[0]] - chroma[pairs[1]]) ** 2).sum(1)
         self.alike = np.exp(-apart / (2 * ONE_COLOUR**2))
         band = outer_band(view)
+        band = band[among[band]]
         band = band[generator.permutation(len(band))[:BAND]]
         self.of_band, self.rough = pseudo.left[band], rough[band]
 
@@ -150,9 +161,10 @@ def _unimodular(A: Float) -> Float:
     return scaled
 
 
-def resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, generator: np.random.Generator) -> Float:
-    """(3, 3) A of b = A b', camera frame, |det A| = 1; rough (pixels, 3): the inflated silhouette's normals; start (3, 3): first guess."""
-    known = _Known(view, pseudo, rough, generator)
+def resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, generator: np.random.Generator, among: Bool | None = None) -> Float:
+    """(3, 3) A of b = A b', camera frame, |det A| = 1; rough (pixels, 3): the inflated silhouette's normals; start (3, 3): first guess;
+    among (pixels,): those that have a say, all by default."""
+    known = _Known(view, pseudo, rough, generator, np.ones(len(rough), bool) if among is None else among)
     A = _unimodular(start)
     for h in np.geomspace(LOOSE, TIGHT, SWEEPS):
         scale = max(MAD_TO_SIGMA * float(np.median(np.abs(known.curl(A)))), 1e-12)

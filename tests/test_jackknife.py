@@ -1,0 +1,71 @@
+"""By how much one view's normals are wrong together: stated without the truth, and held against it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mvps.jackknife import QUARTERS, at_corners, shared_variance, without_quarters
+from mvps.joint.bas_relief import bas_relief, turned
+from mvps.mesh import angles_deg
+from mvps.oneview import lights_of_view
+from mvps.photometric import normal_maps
+from mvps.progress import Progress
+from mvps.relief.integrate import integrate
+from mvps.relief.surface import pixel_surface
+from mvps.scene import Camera, Law
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
+
+CPU = torch.device("cpu")
+LAW = Law((8.0, 32.0, 128.0))
+
+
+def test_every_pixel_is_left_out_once() -> None:
+    pixels = np.argwhere(np.hypot(*(np.indices((31, 40)) - [[[15]], [[20]]])) < 14)
+    stay = np.stack(without_quarters(pixels))
+    assert (stay.sum(0) == QUARTERS - 1).all()
+    assert np.allclose(stay.mean(1), 1 - 1 / QUARTERS, atol=0.05)
+
+
+@pytest.mark.parametrize("thin", [1, 2])
+def test_a_mask_of_a_row_or_two_has_quarters(thin: int) -> None:
+    stay = without_quarters(np.argwhere(np.ones((thin, 7), bool)))
+    assert (np.stack(stay).sum(0) == QUARTERS - 1).all()
+
+
+def test_corners_take_the_mean_of_the_pixels_around() -> None:
+    size, flat = 3, np.tile([0.0, 0.0, -1.0], (9, 1))
+    camera = Camera(np.diag([600.0, 600.0, 1.0]), np.eye(3), np.zeros(3), size, size)
+    mask, pixels = np.ones((size, size), bool), np.argwhere(np.ones((size, size), bool))
+    surface = pixel_surface(camera, pixels, flat, integrate(camera, mask, flat, np.ones(9)), 1.0)
+    values = np.zeros(9)
+    values[4] = 1.0
+    found = np.sort(at_corners(values, surface))
+    # Four corners of the middle pixel, which they share with three others; faces around count, of which a pixel has one or two.
+    assert (found[:-4] == 0).all() and (found[-4:] > 0.1).all() and found[-4:].max() < 0.5
+    assert np.allclose(at_corners(np.full(9, 0.3), surface), 0.3)
+
+
+def test_stated_shared_errors_are_those_that_normals_have() -> None:
+    """Over two made objects, root mean squares of all pixels."""
+    stated, measured = [], []
+    for seed in (1, 3):
+        capture, truth = render_capture(SceneSettings(views=1, lights=12, size=72, seed=seed))
+        view = capture.views[0]
+        lights, found = lights_of_view(capture, None, 0, Progress())
+        assert found is not None
+        maps = normal_maps(capture, lights, CPU)[0]
+        variance = shared_variance(view, lights, maps, found, LAW, 0, CPU)
+        assert variance.shape == (len(view.pixels),) and (variance > 0).all()
+        normal, grey = maps.normal.astype(float), maps.albedo.mean(1).astype(float)
+        own = lights.direction[0], lights.intensity[0]
+        G = bas_relief(view, normal, grey, own, LAW, np.random.default_rng(0), CPU)
+        after = turned(G, normal, grey, own[0], own[1].mean(1))[0]
+        true = truth.normals[view.name][view.mask]
+        known = np.isfinite(true).all(1) & (maps.confidence > 0.5)
+        measured.append(np.mean(np.radians(angles_deg(after[known], true[known])) ** 2) / 2)
+        stated.append(variance[known].mean())
+    # Highlights and shadows move single normals besides, in ways of their own.
+    assert 0.4 < np.sqrt(np.mean(stated) / np.mean(measured)) < 1.6
