@@ -184,7 +184,10 @@ def _costs(swept: list[Swept], count: int, offsets: int) -> tuple[Float, NDArray
     known = (total > 0.05 * facing[:, None]).all(1) & (views >= MINIMUM_VIEWS)
     # The variance of n samples about their own mean is short of the true one by (n - 1) / n.
     unbias = views / np.maximum(views - 1, 0.5)
-    return cost / (safe * unit[:, None]) * unbias[:, None], known, views
+    with np.errstate(over="ignore"):
+        # Where hardly a view speaks, of what is not known.
+        mean_cost = cost / (safe * unit[:, None]) * unbias[:, None]
+    return mean_cost, known, views
 
 
 def _lowest(cost: Float, known: NDArray[np.bool_], views: Float, offsets: Float) -> Agreement:
