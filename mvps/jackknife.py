@@ -13,9 +13,9 @@ of either tangential component (jackknife with a block left out: Efron 1982, Kue
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from mvps.cores import on_cores
+from mvps.device import Device
 from mvps.joint.bas_relief import bas_relief, turned
 from mvps.relief.ambiguity import Resolved, resolved
 from mvps.scene import Bool, Float, Int, Law, Lights, NormalMap, Surface, View
@@ -30,7 +30,7 @@ def without_quarters(pixels: Int) -> list[Bool]:
     return [(below != bool(k & 1)) | (right != bool(k & 2)) for k in range(QUARTERS)]
 
 
-def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved, law: Law, seed: int, device: torch.device) -> Float:
+def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved, law: Law, seed: int, device: Device) -> Float:
     """(pixels,) variance of a normal along a tangent, radians^2. lights, maps: of the view under the ambiguity as it was found; law: that
     resolves the bas-relief."""
     normal, albedo = maps.normal.astype(np.float64), maps.albedo.mean(1).astype(np.float64)
