@@ -77,6 +77,14 @@ def machine(device: str) -> str:
     return f"{torch.cuda.get_device_name()}, {found}, torch {torch.__version__}"
 
 
+def evaluated(result: Path, truth: Path) -> dict[str, Any]:
+    """What metrics.json says of a result that was compared with the truth of a capture."""
+    command = ["-m", "mvps.evaluate", str(result), "--truth", str(truth)]
+    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
+    metrics: dict[str, Any] = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
+    return metrics
+
+
 def measure(name: str, captures: Path, preset: str, device: str, folder: Path, repeats: int) -> dict[str, Any]:
     """One row: the figures of one case; seconds are the median of `repeats` runs."""
     capture, options = captures / CASES[name][0], CASES[name][1]
@@ -86,16 +94,14 @@ def measure(name: str, captures: Path, preset: str, device: str, folder: Path, r
     one_light = folder / "one-light.json"
     one_light.write_text(json.dumps({f"view_{k:02d}": [1 + 7 * k % 32] for k in range(1, 21)}), encoding="utf-8")
     options = [str(one_light) if option == "ONE_LIGHT" else option for option in options]
-    result, figures = folder / name, folder / f"{name}.json"
+    result = folder / name
     seconds, peaks = [], []
     for _ in range(repeats):
         start = time.perf_counter()
         command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--device", device, "--quiet"]
         peaks.append(peak_mb([sys.executable, *command, *options]))
         seconds.append(time.perf_counter() - start)
-    command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture), "--json", str(figures)]
-    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
-    metrics = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
+    metrics = evaluated(result, capture)
     stages = metrics["stages"]
     return {
         "case": name,

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from accuracy import machine
+from accuracy import evaluated, machine
 
 HERE = Path(__file__).resolve().parent
 CAPTURES = ("bunny", "armadillo", "spot", "buddha")
@@ -104,8 +104,7 @@ def row(capture: Path, variant: str, preset: str, folder: Path) -> dict[str, Any
         # A result holds normals in single precision.
         for path in (out / "normals").glob("*.npy"):
             np.save(path, np.load(path).astype(np.float32))
-    subprocess.run([sys.executable, "-m", "mvps.evaluate", str(out), "--truth", str(capture)], check=True, stdout=subprocess.DEVNULL)
-    metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+    metrics = evaluated(out, capture)
     first = folder / VARIANTS[0].replace(" ", "-")
     same = all((out / name).read_bytes() == (first / name).read_bytes() for name in COMPARED)
     return {"variant": variant, **metrics["truth"], "status": metrics["status"]["name"], "same_bytes": same}

@@ -18,7 +18,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from accuracy import machine, table
+from accuracy import evaluated, machine, table
 
 HERE = Path(__file__).resolve().parent
 
@@ -53,9 +53,7 @@ def measure(name: str, captures: Path, preset: str, folder: Path) -> dict[str, A
     command = ["-m", "mvps.reconstruct", str(capture), "--out", str(result), "--preset", preset, "--quiet", *options]
     subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
     seconds = time.perf_counter() - start
-    command = ["-m", "mvps.evaluate", str(result), "--truth", str(capture)]
-    subprocess.run([sys.executable, *command], check=True, stdout=subprocess.DEVNULL)
-    metrics = json.loads((result / "metrics.json").read_text(encoding="utf-8"))
+    metrics = evaluated(result, capture)
     figures = {key: metrics["truth"][key] for _, key, *_ in COLUMNS if key in metrics["truth"]}
     return {**figures, "case": name, "seconds": seconds, "status": metrics["status"]["name"]}
 

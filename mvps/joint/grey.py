@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from mvps.joint.blocks import DirectionalLights
-from mvps.mesh import angles_deg, normalise
+from mvps.mesh import normalise
 from mvps.scene import Float, Lights
 
 
@@ -29,10 +29,3 @@ def coloured_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig:
     directions = [normalise(of_view.direction.double().cpu().numpy()) for of_view in grey]
     intensities = [of_view.intensity.double().cpu().numpy()[:, None] * r for of_view, r in zip(grey, ratios, strict=True)]
     return Lights(tuple(directions), tuple(intensities), one_rig)
-
-
-def light_change(a: Lights, b: Lights) -> tuple[float, float]:
-    """Mean change of directions (deg) and of intensities (relative)."""
-    turned = np.concatenate([angles_deg(p, q) for p, q in zip(a.direction, b.direction, strict=True)])
-    before, after = np.concatenate(a.intensity), np.concatenate(b.intensity)
-    return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())

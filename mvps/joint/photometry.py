@@ -18,7 +18,7 @@ from mvps.cores import neighbours
 from mvps.joint.blocks import Vertices
 from mvps.joint.choosing import count_lobes, of_chosen_model
 from mvps.joint.fused import vertex_maps
-from mvps.joint.grey import grey_lights, light_change, tensor32
+from mvps.joint.grey import grey_lights, tensor32
 from mvps.joint.lighting import LIGHT_TIE, LIGHT_VERTICES, solved_lights, with_bounce, with_colours
 from mvps.joint.observe import observe
 from mvps.joint.patches import drawn_patches
@@ -70,6 +70,13 @@ def _started(
     return Vertices(tensor32(normal, device), reflectance, torch.full((len(normal),), level, device=device))
 
 
+def _light_change(a: Lights, b: Lights) -> tuple[float, float]:
+    """Mean change of directions (deg) and of intensities (relative)."""
+    turned = np.concatenate([angles_deg(p, q) for p, q in zip(a.direction, b.direction, strict=True)])
+    before, after = np.concatenate(a.intensity), np.concatenate(b.intensity)
+    return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
+
+
 def photometric_round(
     state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
 ) -> dict[str, float]:
@@ -107,7 +114,7 @@ def photometric_round(
     vertices, unknown = with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
     solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
-    moved = light_change(state.lights, solved)
+    moved = _light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
     vertices = vertex_step(state.views, vertices, lights, state.law, free, stated=False)
