@@ -42,6 +42,15 @@ def test_a_view_that_shows_nothing_is_refused(value: int, said: str) -> None:
         contents(Capture("c", (capture.views[0], replace(capture.views[1], samples=samples))))
 
 
+def test_a_photograph_that_is_clipped_throughout_is_named() -> None:
+    view = make_sphere().capture.views[0]
+    samples = view.samples.copy()
+    samples[:, 1] = view.saturation
+    capture, findings = contents(Capture("c", (replace(view, samples=samples),)))
+    assert [(one.about, one.where, one.mended) for one in findings] == [("photograph", f"view_01/{view.lights[1]:03d}", True)]
+    assert np.array_equal(capture.views[0].samples, samples)
+
+
 def test_a_colour_that_is_nowhere_is_refused() -> None:
     capture = make_sphere().capture
     without = tuple(replace(view, samples=view.samples * np.array([1, 0, 1], np.uint16)) for view in capture.views)

@@ -1,6 +1,7 @@
 """Whether there is anything to go by: an object in every mask, all three colours, samples that are neither black nor clipped.
 
-What is refused here no other stage could do anything with: arrays would be empty, and sums of nothing no numbers.
+What is refused here no other stage could do anything with: arrays would be empty, and sums of nothing no numbers. Of photographs that are
+clipped throughout no sample counts anywhere; others tell the object, and these are named.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ LEAST_PIXELS = 64
 
 
 def contents(capture: Capture) -> tuple[Capture, list[Finding]]:
-    """The capture as it is. CaptureError where a view, or a colour in all of them, shows nothing."""
+    """The capture as it is, and the photographs that say nothing. CaptureError where a view, or a colour in all of them, shows nothing."""
     for view in capture.views:
         size = int(view.mask.sum())
         if size < LEAST_PIXELS:
@@ -28,7 +29,14 @@ def contents(capture: Capture) -> tuple[Capture, list[Finding]]:
                 f"{capture.name}: wanted photographs in red, green and blue, or grey ones, given no {colour} in any;"
                 " save what has one colour as grey"
             )
-    return capture, []
+    return capture, [finding for view in capture.views for finding in _clipped(view)]
+
+
+def _clipped(view: View) -> list[Finding]:
+    """The photographs of which every sample in the mask is clipped."""
+    words = "is clipped everywhere inside the mask, so that nothing tells its light; left out"
+    silent = (number for number, shown in zip(view.lights, view.shown, strict=True) if not shown)
+    return [Finding("photograph", f"{view.name}/{number:03d}", words, True) for number in silent]
 
 
 def _check_samples(view: View) -> None:
