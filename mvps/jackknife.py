@@ -21,7 +21,7 @@ from mvps.relief.ambiguity import Resolved, resolved
 from mvps.scene import Bool, Float, Int, Law, Lights, NormalMap, Surface, View
 
 QUARTERS = 4
-"""Of the picture: halves tell a variance from one difference, and eighths share the errors of their neighbours."""
+"""Of the picture: halves would tell a variance from one difference. Other numbers were not tried."""
 
 
 def without_quarters(pixels: Int) -> list[Bool]:

@@ -8,7 +8,6 @@ import torch
 
 from mvps.jackknife import QUARTERS, at_corners, shared_variance, without_quarters
 from mvps.joint.bas_relief import bas_relief, turned
-from mvps.mesh import angles_deg
 from mvps.oneview import lights_of_view
 from mvps.photometric import normal_maps
 from mvps.progress import Progress
@@ -48,10 +47,19 @@ def test_corners_take_the_mean_of_the_pixels_around() -> None:
     assert np.allclose(at_corners(np.full(9, 0.3), surface), 0.3)
 
 
+def shared_part(normal: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(n, 3) what a turn and a bas-relief of all normals (n, 3), camera frame, make of their difference to the true ones: least squares."""
+    turns = np.stack([np.cross(axis, normal) for axis in np.eye(3)], 2)
+    reliefs = normal[:, 2, None, None] * (np.eye(3) - normal[:, :, None] * normal[:, None, :])
+    motions = np.concatenate([turns, reliefs], 2).reshape(-1, 6)
+    return np.asarray(motions @ np.linalg.lstsq(motions, (true - normal).ravel(), rcond=None)[0]).reshape(-1, 3)
+
+
 def test_stated_shared_errors_are_those_that_normals_have() -> None:
-    """Over two made objects, root mean squares of all pixels."""
+    """Over three made objects, root mean squares of all pixels, as far as all normals are wrong together. A few numbers an object: what is
+    stated is within a factor of two."""
     stated, measured = [], []
-    for seed in (1, 3):
+    for seed in (0, 1, 3):
         capture, truth = render_capture(SceneSettings(views=1, lights=12, size=72, seed=seed))
         view = capture.views[0]
         lights, found = lights_of_view(capture, None, 0, Progress())
@@ -62,10 +70,9 @@ def test_stated_shared_errors_are_those_that_normals_have() -> None:
         normal, grey = maps.normal.astype(float), maps.albedo.mean(1).astype(float)
         own = lights.direction[0], lights.intensity[0]
         G = bas_relief(view, normal, grey, own, LAW, np.random.default_rng(0), CPU)
-        after = turned(G, normal, grey, own[0], own[1].mean(1))[0]
-        true = truth.normals[view.name][view.mask]
+        after, true = turned(G, normal, grey, own[0], own[1].mean(1))[0], truth.normals[view.name][view.mask]
         known = np.isfinite(true).all(1) & (maps.confidence > 0.5)
-        measured.append(np.mean(np.radians(angles_deg(after[known], true[known])) ** 2) / 2)
+        wrong = shared_part(after[known] @ view.camera.rotation.T, true[known] @ view.camera.rotation.T)
+        measured.append((wrong**2).sum(1).mean() / 2)
         stated.append(variance[known].mean())
-    # Highlights and shadows move single normals besides, in ways of their own.
-    assert 0.4 < np.sqrt(np.mean(stated) / np.mean(measured)) < 1.6
+    assert 0.5 < np.sqrt(np.mean(stated) / np.mean(measured)) < 2
