@@ -1,7 +1,7 @@
 """One view: photometric stereo whose surface comes from its normals alone.
 
 factorisation -> 3 x 3 ambiguity (relief/ambiguity.py) -> photometric stereo -> rounds of bas-relief, integration and Stage II
-(joint/one_view.py) -> the same result as of many views.
+(joint/one_view.py), each but the first from the ambiguity on, without highlights -> the same result as of many views.
 """
 
 from __future__ import annotations
@@ -67,37 +67,50 @@ def surface_of(view: View, normal: Float, confidence: Float, distance: float) ->
     return pixel_surface(view.camera, view.pixels, local, depth, distance)
 
 
-def lights_of_view(capture: Capture, given: Lights | None, seed: int, progress: Progress) -> tuple[Lights, Resolved | None]:
-    """The given lights, or those of the factorisation with its ambiguity resolved up to what lobes say later, and what resolved it."""
-    from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, normalised, solve_ambiguity, without_gaps
+def first_lights(capture: Capture, seed: int) -> tuple[Lights, Resolved]:
+    """Lights of the capture's only view by factorisation, with its ambiguity resolved up to what lobes say later, and what resolved it."""
+    from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, solve_ambiguity
     from mvps.relief.ambiguity import Resolved, factors, resolved
     from mvps.relief.silhouette import inflated_normals
 
     view = capture.views[0]
-    with progress.stage("lights") as stage:
-        if given is not None:
-            stage.status("given with the capture")
-            return given, None
-        if len(view.lights) < MINIMUM_LIGHTS:
-            raise CaptureError(
-                f"{capture.name}: wanted at least {MINIMUM_LIGHTS} photographs of the one view to solve its lights, given"
-                f" {len(view.lights)}; add photographs, views or --calibrated-lights"
-            )
-        generator = np.random.default_rng(seed)
-        pseudo = factors(view, generator)
-        rough = inflated_normals(view.mask)
-        try:
-            A = resolved(view, pseudo, rough, solve_ambiguity(pseudo.left, rough, pseudo.weight), generator)
-        except np.linalg.LinAlgError as error:
-            raise CaptureError(
-                f"{capture.name}: wanted photographs whose lights span three directions, given ones where {error};"
-                " use other lights or --calibrated-lights"
-            ) from error
-        scaled = without_gaps(pseudo.right @ np.linalg.inv(A))
-        strength = np.linalg.norm(scaled, axis=1, keepdims=True)
-        stage.status(f"one view; three factors leave {100 * pseudo.residual:.1f} % of the images")
-        lights = normalised([scaled / strength @ view.camera.rotation], [strength * colour_ratios(view)], True)
-        return lights, Resolved(pseudo, rough, A)
+    if len(view.lights) < MINIMUM_LIGHTS:
+        raise CaptureError(
+            f"{capture.name}: wanted at least {MINIMUM_LIGHTS} photographs of the one view to solve its lights, given"
+            f" {len(view.lights)}; add photographs, views or --calibrated-lights"
+        )
+    generator = np.random.default_rng(seed)
+    pseudo, rough = factors(view, generator), inflated_normals(view.mask)
+    try:
+        A = resolved(view, pseudo, rough, solve_ambiguity(pseudo.left, rough, pseudo.weight), generator)
+    except np.linalg.LinAlgError as error:
+        raise CaptureError(
+            f"{capture.name}: wanted photographs whose lights span three directions, given ones where {error};"
+            " use other lights or --calibrated-lights"
+        ) from error
+    found = Resolved(pseudo, rough, A)
+    return _lights(view, found, colour_ratios(view)), found
+
+
+def lights_again(view: View, lights: Lights, seed: int) -> tuple[Lights, Resolved]:
+    """The lights with their 3 x 3 ambiguity resolved anew by photographs without highlights, and what resolved it."""
+    from mvps.relief.ambiguity import Resolved, factors_under, resolved
+    from mvps.relief.silhouette import inflated_normals
+
+    strength = lights.intensity[0].mean(1, keepdims=True)
+    pseudo = factors_under(view, lights.direction[0] @ view.camera.rotation.T * strength)
+    rough = inflated_normals(view.mask)
+    found = Resolved(pseudo, rough, resolved(view, pseudo, rough, np.eye(3), np.random.default_rng(seed)))
+    return _lights(view, found, lights.intensity[0] / strength), found
+
+
+def _lights(view: View, found: Resolved, colour: Float) -> Lights:
+    """Lights of what was resolved; colour (lights, 3) of their intensities, mean one."""
+    from mvps.calibrate import normalised, without_gaps
+
+    scaled = without_gaps(found.lights)
+    strength = np.linalg.norm(scaled, axis=1, keepdims=True)
+    return normalised([scaled / strength @ view.camera.rotation], [strength * colour], True)
 
 
 def residuals(view: View, maps: NormalMap, lights: Lights) -> Float:
@@ -156,17 +169,20 @@ def reconstruct_view(
     """A reconstruction from the only view of `used`; the rest as in reconstruct.reconstruct."""
     from mvps.device import chosen_device
     from mvps.jackknife import at_corners, shared_variance
-    from mvps.joint.one_view import ROUNDS, refine_view
+    from mvps.joint.one_view import ROUNDS, Start, refine_view
     from mvps.joint.refine import RefineSettings
     from mvps.outcome import all_lights, normal_pictures, told
     from mvps.photometric import normal_maps
 
     device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
     distance, words = distance_of(view)
-    lights, found = lights_of_view(used, given, settings.seed, progress)
+    with progress.stage("lights") as stage:
+        lights, found = (given, None) if given is not None else first_lights(used, settings.seed)
+        left = f"one view; three factors leave {100 * found.pseudo.residual:.1f} % of the images" if found else ""
+        stage.status(left or "given with the capture")
     with progress.stage("photometric stereo") as stage:
         used, misfits = without_misfits(used, lights, device)
-        maps = normal_maps(used, lights, device)[0]
+        start = Start(lights, normal_maps(used, lights, device)[0], found)
         stage.status(f"{len(misfits)} photographs left out" if misfits else "")
     plan = parts.of(RefineSettings((), free_lights=given is None, final=True))
     with progress.stage("joint refinement", total=rounds) as stage:
@@ -177,11 +193,15 @@ def reconstruct_view(
         def integrated(normal: Float, confidence: Float) -> Surface:
             return surface_of(view, normal, confidence, distance)
 
-        refined = refine_view(used, lights, maps, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
-        if found is not None:
-            shared = at_corners(shared_variance(used.views[0], lights, maps, found, parts.law(), settings.seed, device), refined.surface)
-            material = replace(refined.material, confidence=less_confident(refined.material.confidence, shared))
-            refined = replace(refined, material=material)
+        def again(matt: View, before: Lights) -> Start[Resolved | None]:
+            lights, found = (before, None) if given is not None else lights_again(matt, before, settings.seed)
+            return Start(lights, normal_maps(replace(used, views=(matt,)), lights, device)[0], found)
+
+        refined, start = refine_view(used, start, again, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
+        if start.resolved is not None:
+            shared = shared_variance(used.views[0], start.lights, start.maps, start.resolved, parts.law(), settings.seed, device)
+            confidence = less_confident(refined.material.confidence, at_corners(shared, refined.surface))
+            refined = replace(refined, material=replace(refined.material, confidence=confidence))
         stage.status(refined.status)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)

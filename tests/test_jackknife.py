@@ -8,9 +8,8 @@ import torch
 
 from mvps.jackknife import QUARTERS, at_corners, shared_variance, without_quarters
 from mvps.joint.bas_relief import bas_relief, turned
-from mvps.oneview import lights_of_view
+from mvps.oneview import first_lights
 from mvps.photometric import normal_maps
-from mvps.progress import Progress
 from mvps.relief.integrate import integrate
 from mvps.relief.surface import pixel_surface
 from mvps.scene import Camera, Law
@@ -62,8 +61,7 @@ def test_stated_shared_errors_are_those_that_normals_have() -> None:
     for seed in (0, 1, 3):
         capture, truth = render_capture(SceneSettings(views=1, lights=12, size=72, seed=seed))
         view = capture.views[0]
-        lights, found = lights_of_view(capture, None, 0, Progress())
-        assert found is not None
+        lights, found = first_lights(capture, 0)
         maps = normal_maps(capture, lights, CPU)[0]
         variance = shared_variance(view, lights, maps, found, LAW, 0, CPU)
         assert variance.shape == (len(view.pixels),) and (variance > 0).all()

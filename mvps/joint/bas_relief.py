@@ -127,8 +127,8 @@ def bas_relief(
     """(3, 3) G, world frame, for normals (pixels, 3), world, and grey albedo (pixels,) of the view's foreground, and its lights' directions
     and intensities (lights, 3); among (pixels,): those that have a say, all by default. No motion where none has."""
     frame, (direction, intensity) = _frame(view.camera, view.pixels), lights
-    said = (interior(view) > 0) & (albedo > 0) & (True if among is None else among)
-    rows = np.sort(generator.permutation(np.flatnonzero(said))[:PIXELS])
+    rows = np.sort(generator.permutation(np.flatnonzero((interior(view) > 0) & (albedo > 0)))[:PIXELS])
+    rows = rows if among is None else rows[among[rows]]
     if not len(rows):
         return np.eye(3)
     pixels = _Pixels(view, channel_ratio(intensity), rows, law, device)

@@ -1,7 +1,14 @@
 """Stage II of one view: lights, reflectance and the normals of pixels in turn with the surface that these normals integrate to.
 
-A round:  bas-relief (bas_relief.py) -> normals integrated -> the photometric part of a round on that mesh (photometry.py), whose patches
-keep the mesh's mean slopes. There is no second view to move vertices by.
+A round:  lights and photometric stereo by Lambert's law -> bas-relief (bas_relief.py) -> normals integrated -> the photometric part of a
+round on that mesh (photometry.py), whose patches keep the mesh's mean slopes. There is no second view to move vertices by.
+
+Lambert's law is wrong where lobes shine, and its normals there lean towards half vectors, by which lights and normals turn together and
+no later step turns them back far enough. So every round but the first starts anew, from the photographs without the lobes
+
+    I_pl - s_l cast_pl sum_k w_pk D_k(n_p, h_pl)
+
+of the round before, whose lights are known up to the 3 x 3 ambiguity alone.
 
 The law has all lobes from the start and no more: what resolves the bas-relief cannot be on trial under lights that are off by a bas-relief
 (on trial, spot's and two made captures' lobes were refused, and their normals ended at 7 to 8 degrees in place of 3 to 4), and the diffuse
@@ -11,7 +18,8 @@ term's change at grazing angles turns all normals together as a bas-relief does.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 import torch
@@ -19,13 +27,26 @@ import torch
 from mvps.joint.bas_relief import bas_relief, turned
 from mvps.joint.photometry import Task, photometric_round
 from mvps.joint.refine import Refined, RefineSettings, finished
-from mvps.joint.state import State
+from mvps.joint.state import State, grey_albedo, material_of
 from mvps.mesh import edges, lengths, neighbour_sums
 from mvps.noise import dark_noise_share
-from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, less_confident
+from mvps.rendering import photograph
+from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, View, less_confident
+from mvps.visibility import ray_caster
 
-ROUNDS = {"draft": 1, "standard": 3, "fine": 5}
+ROUNDS = {"draft": 2, "standard": 4, "fine": 6}
 """By preset."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Start(Generic[T]):
+    """What a round starts from: lights, normals and albedo of the pixels under them, and how the lights came to be."""
+
+    lights: Lights
+    maps: NormalMap
+    resolved: T
 
 
 def _without_relief(
@@ -46,10 +67,18 @@ def _without_relief(
     )
 
 
+def without_lobes(view: View, surface: Surface, material: Material, lights: Lights) -> View:
+    """The view's photographs less what the material's lobes send; clipped samples stay as they are."""
+    dark = replace(material, albedo=np.zeros_like(material.albedo))
+    lobes = photograph(ray_caster(surface), dark, view.camera, view.pixels, lights.direction[0], lights.intensity[0])
+    body = np.rint(np.maximum(view.samples - lobes / np.float32(view.scale), 0)).astype(np.uint16)
+    return replace(view, samples=np.where(view.samples < view.saturation, body, view.samples))
+
+
 def refine_view(
     capture: Capture,
-    lights: Lights,
-    maps: NormalMap,
+    start: Start[T],
+    again: Callable[[View, Lights], Start[T]],
     law: Law,
     settings: RefineSettings,
     rounds: int,
@@ -57,16 +86,20 @@ def refine_view(
     device: torch.device,
     integrated: Callable[[Float, Float], Surface],
     on_round: Callable[[int, dict[str, float]], None],
-) -> Refined:
-    """Rounds from lights and photometric stereo of the capture's only view. integrated: the surface of normals (pixels, 3), world, with
-    confidence (pixels,). settings: whose rounds are not used, one view has its own kind."""
+) -> tuple[Refined, Start[T]]:
+    """Rounds from lights and photometric stereo of the capture's only view, and what the last round started from. again: a start from the
+    view without its lobes, under the lights of the round before. integrated: the surface of normals (pixels, 3), world, with confidence
+    (pixels,). settings: whose rounds are not used, one view has its own kind."""
     model = replace(settings.model, sharpness=law.sharpness, grazing=False, bounce=False, gleam=False)
-    generator = np.random.default_rng(seed)
+    generator, view = np.random.default_rng(seed), capture.views[0]
     torch.set_num_threads(1)
     state: State | None = None
     account: list[dict[str, float]] = []
-    carried = None
     for number in range(1, rounds + 1):
+        if state is not None:
+            assert state.vertices is not None
+            start = again(without_lobes(view, state.surface, material_of(state, grey_albedo(state.vertices)), state.lights), state.lights)
+        lights, maps = start.lights, start.maps
         if settings.free_lights:
             lights, maps = _without_relief(capture, lights, maps, law if state is None else state.law, generator, device)
         surface = integrated(maps.normal, maps.confidence)
@@ -74,16 +107,14 @@ def refine_view(
             state = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
         state.surface, state.lights, state.maps, state.gathers = surface, lights, (maps,), {}
         task = Task(settings.free_lights, False, False, False, False, device)
-        changes = photometric_round(state, capture, task, carried, generator)
-        assert state.vertices is not None
-        carried = (surface, state.vertices)
-        lights, maps = state.lights, state.maps[0]
+        changes = photometric_round(state, capture, task, None, generator)
         account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, "vertex_change_px": 0.0})
         on_round(number, account[-1])
     assert state is not None
     refined = finished(state, settings, account, generator)
     material = replace(refined.material, confidence=with_rim(refined.material.confidence, state.surface))
-    return replace(refined, material=_contradicted(material, capture, state, generator, device) if settings.free_lights else material)
+    material = _contradicted(material, capture, state, generator, device) if settings.free_lights else material
+    return replace(refined, material=material), start
 
 
 def with_rim(confidence: Float, surface: Surface) -> Float:

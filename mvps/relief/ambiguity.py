@@ -30,7 +30,7 @@ from mvps.mesh import normalise
 from mvps.scene import Bool, Float, Int, View
 from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, robust_weights, solve_rows
 
-PAIRS, BLOCKS, BAND, FACTORED = 4000, 3000, 1000, 4000
+PAIRS, BLOCKS, BAND, FACTORED = 16000, 12000, 1000, 4000
 """Pairs of pixels, blocks of 2 x 2 pixels and outline pixels that are drawn, and pixels that are factorised: nine unknowns against
 thousands of equations leave the error to the model."""
 
@@ -54,14 +54,13 @@ SHADOWED, BRIGHT_QUANTILE = 0.1, 0.8
 @dataclass(frozen=True)
 class Pseudo:
     """The factors of one view: left (pixels, 3) b' over `bright` (pixels,); right (lights, 3) s'; weight (pixels,) share of samples that
-    were believed; residual, fourth_singular_value as in calibrate.Calibration."""
+    were believed; residual: weighted relative RMS that the factors leave."""
 
     left: Float
     right: Float
     bright: Float
     weight: Float
     residual: float
-    fourth_singular_value: float
 
 
 @dataclass(frozen=True)
@@ -72,21 +71,46 @@ class Resolved:
     rough: Float
     A: Float
 
+    @property
+    def lights(self) -> Float:
+        """(lights, 3) intensity times direction, camera frame."""
+        scaled: Float = self.pseudo.right @ np.linalg.inv(self.A)
+        return scaled
+
+
+class _Relative:
+    """A view's grey photographs over what a pixel is at its brightest: image (pixels, lights) over bright (pixels,), known where neither
+    clipped nor in shadow, and its noise."""
+
+    def __init__(self, view: View) -> None:
+        image = view.samples.astype(np.float32).mean(-1).astype(np.float64) * view.scale
+        self.bright: Float = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1), view.scale)
+        self.known = view.usable() & (image > SHADOWED * self.bright[:, None])
+        self.image: Float = image / self.bright[:, None]
+        self.noise = view.scale / float(np.median(self.bright))
+
+    def factored(self, right: Float) -> Pseudo:
+        """The factors with these lights (lights, 3)."""
+        known = self.known.astype(np.float64)
+        weight = known
+        for _ in range(SWEEPS):
+            left = solve_rows(self.image, weight, right)
+            off = self.image - left @ right.T
+            weight = robust_weights(off, known, self.noise)
+        residual = float(np.sqrt((weight * off**2).sum() / max((weight * self.image**2).sum(), 1e-300)))
+        return Pseudo(left, right, self.bright, weight.mean(1), residual)
+
 
 def factors(view: View, generator: np.random.Generator) -> Pseudo:
     """Robust factorisation of a view's grey photographs: of FACTORED pixels, then of all for these lights."""
-    image = view.samples.astype(np.float32).mean(-1).astype(np.float64) * view.scale
-    bright = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1), view.scale)
-    known = view.usable() & (image > SHADOWED * bright[:, None])
-    image /= bright[:, None]
-    noise = view.scale / float(np.median(bright))
-    drawn = generator.permutation(len(image))[:FACTORED]
-    few = factorise(image[drawn], known[drawn], 3, floor=noise)
-    weight = known.astype(np.float64)
-    for _ in range(SWEEPS):
-        left = solve_rows(image, weight, few.right)
-        weight = robust_weights(image - left @ few.right.T, known.astype(np.float64), noise)
-    return Pseudo(left, few.right, bright, weight.mean(1), few.residual, float(few.singular_values[3]))
+    grey = _Relative(view)
+    drawn = generator.permutation(len(grey.image))[:FACTORED]
+    return grey.factored(factorise(grey.image[drawn], grey.known[drawn], 3, floor=grey.noise).right)
+
+
+def factors_under(view: View, lights: Float) -> Pseudo:
+    """Factors of a view's grey photographs under lights (lights, 3), intensity times direction, that are known up to A."""
+    return _Relative(view).factored(lights)
 
 
 def outer_band(view: View) -> Int:
@@ -103,21 +127,23 @@ class _Known:
     def __init__(self, view: View, pseudo: Pseudo, rough: Float, generator: np.random.Generator, among: Bool) -> None:
         index = view.pixel_index
         corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], -1).reshape(-1, 4)
-        corners = corners[((corners >= 0) & among[corners]).all(1)]
+        corners = corners[(corners >= 0).all(1)]
         blocks = corners[generator.permutation(len(corners))[:BLOCKS]]
+        # Drawn from all, so that answers differ by what is left out and not by what is drawn.
+        blocks = blocks[among[blocks].all(1)]
         centres = pixel_centres(view.pixels)
         ray = np.concatenate([centres, np.ones((len(centres), 1))], 1) @ np.linalg.inv(view.camera.K).T
         self.of_blocks, self.rays = pseudo.left[blocks], ray[blocks]
         self.size = np.maximum(np.linalg.norm(self.of_blocks, axis=2).mean(1) ** 2, 1e-300)
-        rows = np.flatnonzero(among)
-        pairs = rows[generator.integers(0, len(rows), (2, PAIRS))]
+        pairs = generator.integers(0, len(among), (2, PAIRS))
+        pairs = pairs[:, among[pairs].all(0)]
         self.of_pairs, self.brightness = pseudo.left[pairs], np.log(pseudo.bright[pairs])
         chroma = log_chroma(view)
         apart = ((chroma[pairs[0]] - chroma[pairs[1]]) ** 2).sum(1)
         self.alike = np.exp(-apart / (2 * ONE_COLOUR**2))
         band = outer_band(view)
-        band = band[among[band]]
         band = band[generator.permutation(len(band))[:BAND]]
+        band = band[among[band]]
         self.of_band, self.rough = pseudo.left[band], rough[band]
 
     def curl(self, A: Float) -> Float:
