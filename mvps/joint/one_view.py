@@ -8,7 +8,7 @@ no later step turns them back far enough. So every round but the first starts an
 
     I_pl - s_l cast_pl sum_k w_pk D_k(n_p, h_pl)
 
-of the round before, whose lights are known up to the 3 x 3 ambiguity alone.
+of the round before, whose lights are known up to the 3 x 3 ambiguity alone. A round that fits much worse than the one before is undone.
 
 The law has all lobes from the start and no more: what resolves the bas-relief cannot be on trial under lights that are off by a bas-relief
 (on trial, spot's and two made captures' lobes were refused, and their normals ended at 7 to 8 degrees in place of 3 to 4), and the diffuse
@@ -36,6 +36,10 @@ from mvps.visibility import ray_caster
 
 ROUNDS = {"draft": 2, "standard": 4, "fine": 6}
 """By preset."""
+
+WORSE = np.sqrt(2)
+"""Times the least residual of the rounds before from which a round is undone and the last: twice the variance, as where one rig is believed
+(calibrate.py). Where lobes were not understood, what is left without them is worse than the photographs."""
 
 T = TypeVar("T")
 
@@ -87,27 +91,33 @@ def refine_view(
     integrated: Callable[[Float, Float], Surface],
     on_round: Callable[[int, dict[str, float]], None],
 ) -> tuple[Refined, Start[T]]:
-    """Rounds from lights and photometric stereo of the capture's only view, and what the last round started from. again: a start from the
-    view without its lobes, under the lights of the round before. integrated: the surface of normals (pixels, 3), world, with confidence
-    (pixels,). settings: whose rounds are not used, one view has its own kind."""
+    """Rounds from lights and photometric stereo of the capture's only view, and what the last one that was kept started from.
+
+    again: a start from the view without its lobes, under the lights of the round before. integrated: the surface of normals (pixels, 3),
+    world, with confidence (pixels,). settings: whose rounds are not used, one view has its own kind.
+    """
     model = replace(settings.model, sharpness=law.sharpness, grazing=False, bounce=False, gleam=False)
     generator, view = np.random.default_rng(seed), capture.views[0]
     torch.set_num_threads(1)
     state: State | None = None
     account: list[dict[str, float]] = []
     for number in range(1, rounds + 1):
+        following = start
         if state is not None:
             assert state.vertices is not None
-            start = again(without_lobes(view, state.surface, material_of(state, grey_albedo(state.vertices)), state.lights), state.lights)
-        lights, maps = start.lights, start.maps
+            material = material_of(state, grey_albedo(state.vertices))
+            following = again(without_lobes(view, state.surface, material, state.lights), state.lights)
+        lights, maps = following.lights, following.maps
         if settings.free_lights:
             lights, maps = _without_relief(capture, lights, maps, law if state is None else state.law, generator, device)
         surface = integrated(maps.normal, maps.confidence)
-        if state is None:
-            state = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
-        state.surface, state.lights, state.maps, state.gathers = surface, lights, (maps,), {}
-        task = Task(settings.free_lights, False, False, False, False, device)
-        changes = photometric_round(state, capture, task, None, generator)
+        # The round before stays as it is: it may be what is kept.
+        first = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
+        attempt = first if state is None else replace(state, surface=surface, lights=lights, maps=(maps,), gathers={})
+        changes = photometric_round(attempt, capture, Task(settings.free_lights, False, False, False, False, device), None, generator)
+        if changes["residual"] > WORSE * min((before["residual"] for before in account), default=np.inf):
+            break
+        state, start = attempt, following
         account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, "vertex_change_px": 0.0})
         on_round(number, account[-1])
     assert state is not None
