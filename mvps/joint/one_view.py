@@ -3,8 +3,8 @@
 A round:  lights and photometric stereo by Lambert's law -> bas-relief (bas_relief.py) -> normals integrated -> the photometric part of a
 round on that mesh (photometry.py), whose patches keep the mesh's mean slopes. There is no second view to move vertices by.
 
-Lambert's law is wrong where lobes shine, and its normals there lean towards half vectors, by which lights and normals turn together and
-no later step turns them back far enough. So every round but the first starts anew, from the photographs without the lobes
+Lambert's law is wrong where lobes shine, by which lights and normals turn together (docs/findings/one_view.md), and no later step turns
+them back far enough. So every round but the first starts anew, from the photographs without the lobes
 
     I_pl - s_l cast_pl sum_k w_pk D_k(n_p, h_pl)
 
