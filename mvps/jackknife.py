@@ -2,10 +2,10 @@
 
 Lights and normals of one view stand where integrability, few albedos, the outline and lobes put them. What these get wrong is shared by the
 pixels of a region, and turns all lights and normals alike, which no photograph contradicts. So both steps, the ambiguity of the factors
-(relief/ambiguity.py) and the bas-relief after it (joint/bas_relief.py), are done again without each quarter of the picture. The normals n_k
+(relief/ambiguity.py) and the bas-relief after it (joint/bas_relief.py), are done again without each ninth of the picture. The normals n_k
 that come out have about their mean the variance
 
-    sigma^2 = (QUARTERS - 1) / QUARTERS sum_k |n_k - mean n|^2 / 2
+    sigma^2 = (K - 1) / K sum_k |n_k - mean n|^2 / 2,       K = 9,
 
 of either tangential component (jackknife with a block left out: Efron 1982, Kuensch 1989).
 """
@@ -17,17 +17,19 @@ import numpy as np
 from mvps.cores import on_cores
 from mvps.device import Device
 from mvps.joint.bas_relief import bas_relief, turned
-from mvps.relief.ambiguity import Resolved, resolved
+from mvps.relief.ambiguity import Resolved, resolved_by
 from mvps.scene import Bool, Float, Int, Law, Lights, NormalMap, Surface, View
 
-QUARTERS = 4
-"""Of the picture: halves would tell a variance from one difference. Other numbers were not tried."""
+ACROSS = 3
+"""Parts of the picture along either axis. In quarters a ball is the same four times, and without one so much outline is missing that
+answers under noise go astray; sixteen slices tell no more (docs/findings/one_view.md)."""
 
 
-def without_quarters(pixels: Int) -> list[Bool]:
-    """(n,) for each quarter the pixels (n, 2) outside of it: above or below the median row, left or right of the median column."""
-    below, right = (of > np.median(of) for of in pixels.T)
-    return [(below != bool(k & 1)) | (right != bool(k & 2)) for k in range(QUARTERS)]
+def without_parts(pixels: Int) -> list[Bool]:
+    """(n,) for each ninth of the picture the pixels (n, 2) outside of it, of thirds of the rows and of the columns."""
+    row, column = (np.searchsorted(np.quantile(of, np.arange(1, ACROSS) / ACROSS), of) for of in pixels.T)
+    part = row * ACROSS + column
+    return [part != k for k in range(ACROSS**2)]
 
 
 def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved, law: Law, seed: int, device: Device) -> Float:
@@ -38,7 +40,7 @@ def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved
     colour, rotation = lights.intensity[0] / grey[:, None], view.camera.rotation
 
     def normals(among: Bool) -> Float:
-        A = resolved(view, found.pseudo, found.rough, found.A, np.random.default_rng(seed), among)
+        A = resolved_by(view, found, np.random.default_rng(seed), among)
         # b -> B b takes lights to B^-T s.
         B = rotation.T @ A @ np.linalg.inv(found.A) @ rotation
         n, a, towards, strength = turned(np.linalg.inv(B).T, normal, albedo, direction, grey)
@@ -46,9 +48,9 @@ def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved
         G = bas_relief(view, n, a, own, law, np.random.default_rng(seed), device, among)
         return turned(G, n, a, towards, strength)[0]
 
-    replicas = np.stack(on_cores(normals, without_quarters(view.pixels)))
+    replicas = np.stack(on_cores(normals, without_parts(view.pixels)))
     scatter = ((replicas - replicas.mean(0)) ** 2).sum((0, 2))
-    variance: Float = (QUARTERS - 1) / QUARTERS * scatter / 2
+    variance: Float = (1 - 1 / len(replicas)) * scatter / 2
     return variance
 
 

@@ -187,16 +187,25 @@ def _unimodular(A: Float) -> Float:
     return scaled
 
 
-def resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, generator: np.random.Generator, among: Bool | None = None) -> Float:
-    """(3, 3) A of b = A b', camera frame, |det A| = 1; rough (pixels, 3): the inflated silhouette's normals; start (3, 3): first guess;
-    among (pixels,): those that have a say, all by default."""
-    known = _Known(view, pseudo, rough, generator, np.ones(len(rough), bool) if among is None else among)
+def _solved(known: _Known, start: Float, h: float) -> Float:
+    """A that minimises the losses with albedos' kernel h, from start."""
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(known.curl(start)))), 1e-12)
+
+    def residuals(x: NDArray[np.float64]) -> Float:
+        return known.residuals(_unimodular(x.reshape(3, 3)), h, scale)
+
+    return _unimodular(least_squares(residuals, start.ravel(), max_nfev=20).x.reshape(3, 3))
+
+
+def resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, generator: np.random.Generator) -> Float:
+    """(3, 3) A of b = A b', camera frame, |det A| = 1; rough (pixels, 3): the inflated silhouette's normals; start (3, 3): first guess."""
+    known = _Known(view, pseudo, rough, generator, np.ones(len(rough), bool))
     A = _unimodular(start)
     for h in np.geomspace(LOOSE, TIGHT, SWEEPS):
-        scale = max(MAD_TO_SIGMA * float(np.median(np.abs(known.curl(A)))), 1e-12)
-
-        def residuals(x: NDArray[np.float64], h: float = float(h), scale: float = scale) -> Float:
-            return known.residuals(_unimodular(x.reshape(3, 3)), h, scale)
-
-        A = _unimodular(least_squares(residuals, A.ravel(), max_nfev=20).x.reshape(3, 3))
+        A = _solved(known, A, float(h))
     return A
+
+
+def resolved_by(view: View, found: Resolved, generator: np.random.Generator, among: Bool) -> Float:
+    """A as some pixels among (pixels,) alone have it, near the one that was found by all."""
+    return _solved(_Known(view, found.pseudo, found.rough, generator, among), found.A, TIGHT)
