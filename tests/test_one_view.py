@@ -13,10 +13,12 @@ import torch
 from mvps.evaluate import evaluate_result
 from mvps.evaluate import main as evaluate
 from mvps.joint.bas_relief import bas_relief, turned
-from mvps.joint.one_view import with_rim, without_lobes
+from mvps.joint.one_view import Start, refine_view, with_rim, without_lobes
+from mvps.joint.refine import RefineSettings
 from mvps.load import read_capture
 from mvps.mesh import angles_deg
-from mvps.oneview import distance_of, first_lights, lights_again, without_misfits
+from mvps.oneview import distance_of, first_lights, lights_again, surface_of, without_misfits
+from mvps.photometric import normal_maps
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
 from mvps.reconstruct import main as reconstruct_main
@@ -91,6 +93,30 @@ def test_a_capture_of_one_view_becomes_a_result_that_evaluate_reads(made: tuple[
         assert (tmp_path / "result" / name).exists()
     metrics = (tmp_path / "result" / "metrics.json").read_text()
     assert "One view:" in metrics and "the world origin's" in metrics
+
+
+def test_a_round_that_fits_much_worse_is_undone(made: tuple[Capture, Truth]) -> None:
+    """Started anew under lights in the wrong order, the second of three rounds is the last and leaves no trace."""
+    capture, truth = made
+    view, device = capture.views[0], torch.device("cpu")
+    true = Lights((truth.direction[view.name],), (truth.intensity[view.name],), True)
+    wrong = Lights((true.direction[0][::-1].copy(),), true.intensity, True)
+    tried = []
+
+    def again(_: View, __: Lights) -> Start[str]:
+        tried.append(1)
+        return Start(wrong, normal_maps(capture, wrong, device)[0], "wrong")
+
+    def integrated(normal: np.ndarray, confidence: np.ndarray) -> Surface:
+        return surface_of(view, normal, confidence, distance_of(view)[0])
+
+    start = Start(true, normal_maps(capture, true, device)[0], "true")
+    law, settings = Law((8.0, 32.0, 128.0)), RefineSettings((), free_lights=False)
+    refined, kept = refine_view(capture, start, again, law, settings, 3, 0, device, integrated, lambda *_: None)
+    assert tried == [1] and kept.resolved == "true"
+    assert len(refined.rounds) == 1 and angles_deg(refined.lights.direction[0], true.direction[0]).max() < 0.01
+    normal = refined.maps[0].normal
+    assert angles_deg(normal, truth.normals[view.name][view.mask]).mean() < 5
 
 
 @pytest.mark.parametrize(("name", "lights", "normals", "factor"), [("ball", 2.0, 3.5, np.inf), ("bear", 3.0, 5.5, 2.5)])
