@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
@@ -31,8 +32,12 @@ from mvps.scene import Bool, Float, Int, View
 from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, robust_weights, solve_rows
 
 PAIRS, BLOCKS, BAND, FACTORED = 16000, 12000, 1000, 4000
-"""Pairs of pixels, blocks of 2 x 2 pixels and outline pixels that are drawn, and pixels that are factorised: nine unknowns against
+"""Pairs of pixels, blocks of 2 x 2 cells and outline pixels that are drawn, and pixels that are factorised: nine unknowns against
 thousands of equations leave the error to the model."""
+
+CELL = 2
+"""Side of a cell, pixels: its mean has half of the noise of a pixel, which else says more than the slopes' curl where it is some percent,
+and detail of four pixels is left."""
 
 LOOSE, TIGHT = 0.4, 0.1
 """h of the albedos' logarithms: from the error of a first guess to the shades of one paint."""
@@ -40,8 +45,9 @@ LOOSE, TIGHT = 0.4, 0.1
 ROUGH = 0.2
 """Scale, radians, of the outline's normals: a pixel from the edge of a ball of 50 pixels the normal has turned by as much."""
 
-SHARE_OF_OUTLINE = 0.1
-"""Weight of the outline beside the other two: it is a guess, and only has to keep convex from concave."""
+SHARE_OF_OUTLINE = 0.3
+"""Weight of the outline beside the other two: a guess, which keeps convex from concave and holds what noise leaves open of them (at 0.1 it
+turned lights by 8 deg, docs/findings/one_view.md)."""
 
 ONE_COLOUR = 0.05
 """Difference of log chroma at which two pixels no longer count as of one colour."""
@@ -121,19 +127,27 @@ def outer_band(view: View) -> Int:
     return np.flatnonzero((depth > 1.5) & (depth <= max(4.0, 0.1 * radius)))
 
 
+def _blocks(index: Int) -> Int:
+    """(n, 2, CELL, 2, CELL) positions of pixels in every square of 2 x 2 cells that the mask holds; index (height, width), -1 outside."""
+    side = 2 * CELL
+    if min(index.shape) < side:
+        return np.zeros((0, 2, CELL, 2, CELL), index.dtype)
+    squares = sliding_window_view(index, (side, side)).reshape(-1, side, side)
+    return squares[(squares >= 0).all((1, 2))].reshape(-1, 2, CELL, 2, CELL)
+
+
 class _Known:
     """Residuals of what is known of b = A b', for pixels drawn among some (pixels,)."""
 
     def __init__(self, view: View, pseudo: Pseudo, rough: Float, generator: np.random.Generator, among: Bool) -> None:
-        index = view.pixel_index
-        corners = np.stack([index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]], -1).reshape(-1, 4)
-        corners = corners[(corners >= 0).all(1)]
-        blocks = corners[generator.permutation(len(corners))[:BLOCKS]]
+        # (n, row of cells, row in a cell, column of cells, column in a cell)
+        blocks = _blocks(view.pixel_index)
+        blocks = blocks[generator.permutation(len(blocks))[:BLOCKS]]
         # Drawn from all, so that answers differ by what is left out and not by what is drawn.
-        blocks = blocks[among[blocks].all(1)]
+        blocks = blocks[among[blocks].all((1, 2, 3, 4))]
         centres = pixel_centres(view.pixels)
         ray = np.concatenate([centres, np.ones((len(centres), 1))], 1) @ np.linalg.inv(view.camera.K).T
-        self.of_blocks, self.rays = pseudo.left[blocks], ray[blocks]
+        self.of_blocks, self.rays = (of[blocks].mean((2, 4)).reshape(-1, 4, 3) for of in (pseudo.left, ray))
         self.size = np.maximum(np.linalg.norm(self.of_blocks, axis=2).mean(1) ** 2, 1e-300)
         pairs = generator.integers(0, len(among), (2, PAIRS))
         pairs = pairs[:, among[pairs].all(0)]
@@ -168,7 +182,7 @@ class _Known:
         off /= np.sqrt(1 + (off**2).sum(1, keepdims=True))
         return np.concatenate(
             [
-                np.sign(curl) * np.sqrt(np.log1p(curl**2) / len(curl)),
+                np.sign(curl) * np.sqrt(np.log1p(curl**2) / max(len(curl), 1)),
                 np.sign(apart) * np.sqrt(-np.expm1(-(apart**2) / 2) * self.alike / max(float(self.alike.sum()), 1e-300)),
                 off.ravel() * np.sqrt(SHARE_OF_OUTLINE / max(len(off), 1)),
             ]
@@ -189,7 +203,8 @@ def _unimodular(A: Float) -> Float:
 
 def _solved(known: _Known, start: Float, h: float) -> Float:
     """A that minimises the losses with albedos' kernel h, from start."""
-    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(known.curl(start)))), 1e-12)
+    curl = known.curl(start)
+    scale = max(MAD_TO_SIGMA * float(np.median(np.abs(curl))), 1e-12) if len(curl) else 1.0
 
     def residuals(x: NDArray[np.float64]) -> Float:
         return known.residuals(_unimodular(x.reshape(3, 3)), h, scale)
