@@ -92,14 +92,13 @@ def first_lights(capture: Capture, seed: int) -> tuple[Lights, Resolved]:
     return _lights(view, found, colour_ratios(view)), found
 
 
-def lights_again(view: View, lights: Lights, seed: int) -> tuple[Lights, Resolved]:
-    """The lights with their 3 x 3 ambiguity resolved anew by photographs without highlights, and what resolved it."""
+def lights_again(view: View, lights: Lights, rough: Float, seed: int) -> tuple[Lights, Resolved]:
+    """The lights with their 3 x 3 ambiguity resolved anew by photographs without highlights, and what resolved it; rough (pixels, 3): the
+    inflated silhouette's normals."""
     from mvps.relief.ambiguity import Resolved, factors_under, resolved
-    from mvps.relief.silhouette import inflated_normals
 
     strength = lights.intensity[0].mean(1, keepdims=True)
     pseudo = factors_under(view, lights.direction[0] @ view.camera.rotation.T * strength)
-    rough = inflated_normals(view.mask)
     found = Resolved(pseudo, rough, resolved(view, pseudo, rough, np.eye(3), np.random.default_rng(seed)))
     return _lights(view, found, lights.intensity[0] / strength), found
 
@@ -194,15 +193,16 @@ def reconstruct_view(
             return surface_of(view, normal, confidence, distance)
 
         def again(matt: View, before: Lights) -> Start[Resolved | None]:
-            lights, found = (before, None) if given is not None else lights_again(matt, before, settings.seed)
-            return Start(lights, normal_maps(replace(used, views=(matt,)), lights, device)[0], found)
+            lights, anew = (before, None) if found is None else lights_again(matt, before, found.rough, settings.seed)
+            return Start(lights, normal_maps(replace(used, views=(matt,)), lights, device)[0], anew)
 
         refined, start = refine_view(used, start, again, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
         if start.resolved is not None:
             shared = shared_variance(used.views[0], start.lights, start.maps, start.resolved, parts.law(), settings.seed, device)
             confidence = less_confident(refined.material.confidence, at_corners(shared, refined.surface))
             refined = replace(refined, material=replace(refined.material, confidence=confidence))
-        stage.status(refined.status)
+        undone = len(refined.rounds) + 1
+        stage.status(refined.status + (f"; round {undone} fitted much worse and was undone" if undone <= rounds else ""))
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
         pictures = normal_pictures(capture, used, refined)

@@ -22,6 +22,7 @@ from mvps.photometric import normal_maps
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
 from mvps.reconstruct import main as reconstruct_main
+from mvps.relief.silhouette import inflated_normals
 from mvps.rendering import photograph
 from mvps.scene import Capture, CaptureError, Law, Lights, Material, Surface, Truth, View, less_confident
 from mvps.sound import sound
@@ -119,15 +120,15 @@ def test_a_round_that_fits_much_worse_is_undone(made: tuple[Capture, Truth]) -> 
     assert angles_deg(normal, truth.normals[view.name][view.mask]).mean() < 5
 
 
-@pytest.mark.parametrize(("name", "lights", "normals", "factor"), [("ball", 2.0, 3.5, np.inf), ("bear", 3.0, 5.5, 2.5)])
-def test_photographs_without_calibration(captures: Path, tmp_path: Path, name: str, lights: float, normals: float, factor: float) -> None:
+@pytest.mark.parametrize(("name", "lights", "normals"), [("ball", 2.0, 3.5), ("bear", 3.0, 5.5)])
+def test_photographs_without_calibration(captures: Path, tmp_path: Path, name: str, lights: float, normals: float) -> None:
     """Photographs of DiLiGenT (Shi et al. 2016). What is wrong with ball, slopes that are 3 % too steep, comes out under its true lights
     too, and nothing in its photographs tells of it: its stated errors are not held against anything."""
     reconstruct_main([str(captures / name), "--out", str(tmp_path / "result"), "--quiet"])
     errors = evaluate_result(tmp_path / "result", captures / name)
     assert errors["light_error_deg"] < lights
     assert errors["map_normal_error_deg"] < normals
-    assert errors["confidence_factor"] < factor
+    assert name == "ball" or errors["confidence_factor"] < 2.5
 
 
 def test_without_lobes_lights_are_found_that_highlights_turn() -> None:
@@ -147,7 +148,7 @@ def test_without_lobes_lights_are_found_that_highlights_turn() -> None:
     assert without < 0.2 * with_lobes
 
     first = first_lights(glossy, 0)[0]
-    again = lights_again(body, first, 0)[0]
+    again = lights_again(body, first, inflated_normals(view.mask), 0)[0]
     before, after = (angles_deg(found.direction[0], true).mean() for found in (first, again))
     assert before > 5 and after < 0.5 * before
 

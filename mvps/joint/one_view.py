@@ -8,7 +8,7 @@ them back far enough. So every round but the first starts anew, from the photogr
 
     I_pl - s_l cast_pl sum_k w_pk D_k(n_p, h_pl)
 
-of the round before, whose lights are known up to the 3 x 3 ambiguity alone. A round that fits much worse than the one before is undone.
+of the round before, whose lights are known up to the 3 x 3 ambiguity alone. A round that fits much worse than the best before is undone.
 
 The law has all lobes from the start and no more: what resolves the bas-relief cannot be on trial under lights that are off by a bas-relief
 (on trial, spot's and two made captures' lobes were refused, and their normals ended at 7 to 8 degrees in place of 3 to 4), and the diffuse
@@ -112,8 +112,10 @@ def refine_view(
             lights, maps = _without_relief(capture, lights, maps, law if state is None else state.law, generator, device)
         surface = integrated(maps.normal, maps.confidence)
         # The round before stays as it is: it may be what is kept.
-        first = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
-        attempt = first if state is None else replace(state, surface=surface, lights=lights, maps=(maps,), gathers={})
+        if state is None:
+            attempt = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
+        else:
+            attempt = replace(state, surface=surface, lights=lights, maps=(maps,), gathers={})
         changes = photometric_round(attempt, capture, Task(settings.free_lights, False, False, False, False, device), None, generator)
         if changes["residual"] > WORSE * min((before["residual"] for before in account), default=np.inf):
             break

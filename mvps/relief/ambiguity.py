@@ -36,8 +36,8 @@ PAIRS, BLOCKS, BAND, FACTORED = 16000, 12000, 1000, 4000
 thousands of equations leave the error to the model."""
 
 CELL = 2
-"""Side of a cell, pixels: its mean has half of the noise of a pixel, which else says more than the slopes' curl where it is some percent,
-and detail of four pixels is left."""
+"""Side of a cell, pixels, whose mean has half of a pixel's noise: with single pixels noise of some percent outweighs the slopes' curl, and
+larger cells blur the slopes."""
 
 LOOSE, TIGHT = 0.4, 0.1
 """h of the albedos' logarithms: from the error of a first guess to the shades of one paint."""
@@ -46,8 +46,8 @@ ROUGH = 0.2
 """Scale, radians, of the outline's normals: a pixel from the edge of a ball of 50 pixels the normal has turned by as much."""
 
 SHARE_OF_OUTLINE = 0.3
-"""Weight of the outline beside the other two: a guess, which keeps convex from concave and holds what noise leaves open of them (at 0.1 it
-turned lights by 8 deg, docs/findings/one_view.md)."""
+"""Weight of the outline beside the other two: a guess, which keeps convex from concave and holds what noise leaves open of them (at 0.1,
+noise of 3 % turned lights by up to 8 deg, docs/findings/one_view.md)."""
 
 ONE_COLOUR = 0.05
 """Difference of log chroma at which two pixels no longer count as of one colour."""
@@ -128,7 +128,10 @@ def outer_band(view: View) -> Int:
 
 
 def _blocks(index: Int) -> Int:
-    """(n, 2, CELL, 2, CELL) positions of pixels in every square of 2 x 2 cells that the mask holds; index (height, width), -1 outside."""
+    """(n, 2, CELL, 2, CELL) positions of pixels in every square of 2 x 2 cells that the mask holds, none where it is too thin.
+
+    index (height, width) of pixels, -1 outside.
+    """
     side = 2 * CELL
     if min(index.shape) < side:
         return np.zeros((0, 2, CELL, 2, CELL), index.dtype)
