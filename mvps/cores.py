@@ -1,4 +1,5 @@
-"""How much is worked on at a time: one thing to a core, and fewer where memory is short.
+"""How much is worked on at a time: one thing to a core, and fewer where memory is short. What is dealt out within such a thing goes to the
+cores that are its share: twice as many threads as cores would only wait for each other.
 
 Every view (or half of them) that is worked on holds arrays of its own, so their number at a time decides how much memory is held beyond
 what the photographs and the mesh need. No value depends on it: results come in order.
@@ -7,10 +8,12 @@ what the photographs and the mesh need. No value depends on it: results come in 
 from __future__ import annotations
 
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,11 +28,13 @@ MANY_POINTS = 1 << 14
 """Below, starting threads takes longer than looking for points' neighbours (about 2 microseconds each)."""
 
 _most = [len(os.sched_getaffinity(0))]
+_thread = threading.local()
 
 
 def at_a_time() -> int:
-    """Things that are worked on at a time: the number of cores, unless `work_on` set less."""
-    return _most[0]
+    """Things that are worked on at a time: the number of cores, unless `work_on` set less; within a thing, its share of them."""
+    share: int = getattr(_thread, "share", _most[0])
+    return share
 
 
 def work_on(most: int) -> None:
@@ -45,16 +50,26 @@ def blas_as_asked() -> None:
         threadpool_limits(int(asked), "blas")
 
 
+def _pool(things: int) -> ThreadPoolExecutor:
+    """Threads for so many things."""
+    threads = max(1, min(things, at_a_time()))
+    share = at_a_time() // threads
+    return ThreadPoolExecutor(threads, initializer=lambda: setattr(_thread, "share", share))
+
+
 def on_cores(task: Callable[..., Result], *arguments: Iterable[Any]) -> list[Result]:
     """[task(first arguments), task(second ones) ...] on all cores: numpy, torch and Embree release the interpreter's lock."""
-    with ThreadPoolExecutor(at_a_time()) as pool:
-        return list(pool.map(task, *arguments))
+    things = list(zip(*arguments, strict=True))
+    if min(len(things), at_a_time()) < 2:
+        return [task(*thing) for thing in things]
+    with _pool(len(things)) as pool:
+        return list(pool.map(lambda thing: task(*thing), things))
 
 
 def one_by_one(task: Callable[[int], Result], total: int) -> Iterator[Result]:
     """task(0), task(1) ... of `total` on all cores, in this order, for results too large to hold all: while one is used, the next are
     being made, and no more than one waits."""
-    with ThreadPoolExecutor(at_a_time()) as pool:
+    with _pool(total) as pool:
         waiting: deque[Future[Result]] = deque()
         for number in range(total):
             if len(waiting) > at_a_time():
@@ -62,6 +77,23 @@ def one_by_one(task: Callable[[int], Result], total: int) -> Iterator[Result]:
             waiting.append(pool.submit(task, number))
         while waiting:
             yield waiting.popleft().result()
+
+
+class computed_once(cached_property[Result]):
+    """A cached property that is computed once even where threads ask for it at the same time (functools' own, from Python 3.12 on, by
+    each of them)."""
+
+    def __init__(self, function: Callable[[Any], Result]) -> None:
+        super().__init__(function)
+        self._lock = threading.RLock()
+
+    @overload
+    def __get__(self, instance: None, owner: type[Any] | None = None) -> Self: ...
+    @overload
+    def __get__(self, instance: object, owner: type[Any] | None = None) -> Result: ...
+    def __get__(self, instance: object, owner: type[Any] | None = None) -> Any:
+        with self._lock:
+            return super().__get__(instance, owner)
 
 
 def neighbours(tree: cKDTree, points: NDArray[Any], k: int = 1, p: float = 2) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -7,7 +7,7 @@ over the surface a shadow so begins h / tan b too late.
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from mvps.camera import pixel_centres, project, rays, view_directions
-from mvps.cores import on_cores
+from mvps.cores import computed_once, on_cores
 from mvps.mesh import edges, mean_edge_length, vertex_normals
 from mvps.scene import Bool, Camera, Float, Int, Surface
 
@@ -49,17 +49,17 @@ class RayCaster:
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
         self.surface = surface
 
-    @cached_property
+    @computed_once
     def vertex_normals(self) -> Float:
         """(V, 3) vertex normals of the mesh, computed when first asked for."""
         return vertex_normals(self.surface)
 
-    @cached_property
+    @computed_once
     def offset(self) -> float:
         """Rays that leave the mesh start this far away."""
         return OFFSET_EDGES * mean_edge_length(self.surface)
 
-    @cached_property
+    @computed_once
     def around(self) -> sp.csr_matrix:
         """(V, V) 1 where an edge joins two vertices, and for a vertex and itself."""
         n, pairs = len(self.surface.vertices), edges(self.surface)
