@@ -23,6 +23,9 @@ from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA
 FLOOR = 1e-7
 """Damping of an unknown relative to the largest diagonal entry of its problem: above float32's rounding, below any measurement."""
 
+RAISES = tuple(10.0**k for k in range(-6, 4))
+"""Of a diagonal, one after the other."""
+
 
 def _entries_first(values: Tensor) -> Tensor:
     """(p[, k], n) of values (n, p[, k]): operations of a few entries each then run along all problems, which on a CPU takes a quarter of
@@ -85,6 +88,17 @@ def _solved(H: Tensor, right: Tensor) -> Tensor:
         x[k] = (x[k] - (H[k, k + 1 :, None] * x[k + 1 :]).sum(0)) / H[k, k]
     x *= scale[:, None]
     return torch.where(torch.isfinite(x), x, 0)
+
+
+def damped_solution(H: Tensor, right: Tensor) -> Tensor:
+    """x (n,) with H x = right (n,), H (n, n) float64 positive definite but for rounding: by Cholesky's factor, and where there is none with
+    the diagonal raised by as little of itself as it takes (Levenberg 1944). 0 where nothing helps."""
+    diagonal = H.diagonal().abs()
+    for damping in (0, *RAISES):
+        factor, failed = torch.linalg.cholesky_ex(H + torch.diag(damping * diagonal) if damping else H)
+        if not failed:
+            return torch.cholesky_solve(right[:, None], factor)[:, 0]
+    return torch.zeros_like(right)
 
 
 def weighted_rows(M: Tensor, W: Tensor, Y: Tensor, ridge: float) -> Tensor:

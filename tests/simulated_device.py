@@ -97,7 +97,7 @@ class _Generator(torch.Generator):
 class _InTurn:
     """In the place of threads, which know nothing of the modes."""
 
-    def __init__(self, _: int) -> None: ...
+    def __init__(self, _: int, initializer: object = None) -> None: ...
 
     def __enter__(self) -> _InTurn:
         return self

@@ -10,7 +10,7 @@ from scipy.optimize import lsq_linear
 
 from solvers.adam import Adam
 from solvers.bounded import minimise
-from solvers.least_squares import bounded_step, cauchy_weights, columns_of_inverse, weighted_rows
+from solvers.least_squares import bounded_step, cauchy_weights, columns_of_inverse, damped_solution, weighted_rows
 from solvers.linear import CholeskyLike
 from solvers.low_rank import factorise, robust_weights, solve_rows
 
@@ -158,3 +158,15 @@ def test_few_bounded_variables_are_solved_within_their_bounds_and_calls() -> Non
 def test_a_bounded_search_never_ends_worse_than_its_start() -> None:
     best, value = minimise(lambda x: float(np.abs(x).sum()), np.zeros(1), -np.ones(1), np.ones(1), 0.5, 0.1, 5)
     assert best == 0 and value == 0
+
+
+def test_a_matrix_that_rounding_made_indefinite_still_gives_a_step_down() -> None:
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randn(5, 8, generator=generator, dtype=torch.float64)
+    semidefinite, gradient = rows.T @ rows, rows.T @ torch.ones(5, dtype=torch.float64)
+    definite = semidefinite + torch.eye(8, dtype=torch.float64)
+    torch.testing.assert_close(damped_solution(definite, gradient), torch.linalg.solve(definite, gradient))
+    step = damped_solution(semidefinite - 1e-9 * torch.eye(8, dtype=torch.float64), gradient)
+    assert torch.isfinite(step).all() and step @ gradient > 0
+    torch.testing.assert_close(semidefinite @ step, gradient, rtol=1e-3, atol=1e-3)
+    assert (damped_solution(torch.full((2, 2), torch.nan, dtype=torch.float64), gradient[:2]) == 0).all()

@@ -37,16 +37,14 @@ from mvps.joint.blocks import (
     tangents,
     vertex_derivatives,
 )
+from mvps.joint.elimination import Blocks, eliminated
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
 from mvps.joint.shadowed import TIMES, bounce_in_shadow
 from mvps.joint.steps import LARGEST_TURN, Anchor
 from mvps.scene import Law
 from mvps.shading import returned
-
-VERTICES_PER_BLOCK = 128
-"""Eliminated at once: their derivatives by all lights stay in the processor's cache, and where every view has lights of its own, few
-views see any of them. Of 12 views, products take 0.4 of the time of those with all columns; in blocks of 256 0.55, least 0.2."""
+from solvers.least_squares import damped_solution
 
 OF_LAW = 3
 """Unknowns of the law: grazing, bounce and gleam."""
@@ -185,33 +183,7 @@ def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
     return H, g
 
 
-@dataclass(frozen=True)
-class _Reduced:
-    """What vertices that are eliminated add: H (m, m) and g (m,) to the equations of lights and law; E (k, 2, 2), F (k, 2, m) and f (k, 2)
-    of the patches."""
-
-    H: Tensor
-    g: Tensor
-    E: Tensor
-    F: Tensor
-    f: Tensor
-
-    def add(self, other: _Reduced) -> None:
-        """Adds those of other vertices, in place."""
-        for mine, others in ((self.H, other.H), (self.g, other.g), (self.E, other.E), (self.F, other.F), (self.f, other.f)):
-            mine.add_(others)
-
-
-@dataclass(frozen=True)
-class _Blocks:
-    """H_jj + P_j (V, p, p) and g_j (V, p) of the vertices, 0 where free (V, p) is 0: weights at their bound are no unknowns."""
-
-    hessian: Tensor
-    gradient: Tensor
-    free: Tensor
-
-
-def _blocks(sums: _Sums, vertices: Vertices, anchor: Anchor) -> _Blocks:
+def _blocks(sums: _Sums, vertices: Vertices, anchor: Anchor) -> Blocks:
     hessian, gradient = (sums.vertices[:, : -OF_LAW - 1, columns].clone() for columns in (slice(-OF_LAW - 1), -1))
     away, strength = vertices.normal - anchor.normal, sums.count / anchor.sigma**2
     for k, tangent in enumerate(tangents(vertices.normal)):
@@ -222,61 +194,15 @@ def _blocks(sums: _Sums, vertices: Vertices, anchor: Anchor) -> _Blocks:
     free = 1 - held
     hessian = hessian * free[:, :, None] * free[:, None, :] + torch.diag_embed(held)
     hessian = hessian + torch.diag_embed(1e-6 * torch.diagonal(hessian, dim1=1, dim2=2) + 1e-12)
-    return _Blocks(hessian, gradient * free, free)
-
-
-def _eliminated(sums: _Sums, blocks: _Blocks, layout: _Layout, A: Tensor, patches: Patches) -> _Reduced:
-    """Of all vertices, dealt to the cores as `vertex_equations` deals the views; A (V, 2, 2) as in patches.py."""
-    seen = torch.stack([sums.cross[rig].flatten(1).any(1) for rig in range(len(layout.lights))] or [blocks.free.any(1)], 1)
-    # Vertices that the same views see stand together.
-    some = torch.unique(seen, dim=0, return_inverse=True)[1].argsort(stable=True).split(VERTICES_PER_BLOCK)
-
-    def dealt(k: int) -> _Reduced:
-        like, unknowns = A.new_zeros(patches.count, 2), 3 * sum(layout.lights) + OF_LAW
-        total = _Reduced(
-            A.new_zeros(unknowns, unknowns), A.new_zeros(unknowns), A.new_zeros(len(like), 2, 2), A.new_zeros(len(like), 2, unknowns), like
-        )
-        for rows in some[k::WORKERS]:
-            rigs = seen[rows].any(0).nonzero()[:, 0].tolist() if layout.lights else []
-            _eliminate(total, sums, blocks, layout, A, patches, rows, rigs)
-        return total
-
-    total, *others = on_cores(dealt, range(min(WORKERS, len(some))))
-    for other in others:
-        total.add(other)
-    return total
-
-
-def _eliminate(
-    total: _Reduced, sums: _Sums, blocks: _Blocks, layout: _Layout, A: Tensor, patches: Patches, rows: Tensor, rigs: list[int]
-) -> None:
-    """Adds to the total, in place, what some vertices add; rigs: those that light any of them in a view that sees it."""
-    of, device = patches.of[rows], rows.device
-    cross = [*(sums.cross[rig][rows].flatten(2) for rig in rigs), sums.vertices[rows, : -OF_LAW - 1, -OF_LAW - 1 : -1]]
-    ends = [*((layout.start(rig), 3 * layout.lights[rig]) for rig in rigs), (len(total.g) - OF_LAW, OF_LAW)]
-    columns = torch.cat([torch.arange(start, start + length, device=device) for start, length in ends])
-    L = torch.linalg.cholesky(blocks.hessian[rows].double())
-    half = torch.linalg.solve_triangular(L, (torch.cat(cross, 2) * blocks.free[rows][..., None]).double(), upper=False)
-    right = torch.linalg.solve_triangular(L, blocks.gradient[rows].double()[..., None], upper=False)
-    # L^-1 of the normals' columns: products of two such halves have the inverse of the whole block between them.
-    normals = torch.linalg.solve_triangular(L, torch.eye(L.shape[1], 2, dtype=L.dtype, device=device).expand(len(L), -1, -1), upper=False)
-    normals = A[rows] @ normals.transpose(1, 2)
-    total.E.index_add_(0, of, normals @ normals.transpose(1, 2))
-    total.f.index_add_(0, of, (normals @ right)[..., 0])
-    along = total.F.new_zeros(len(of), *total.F.shape[1:])
-    along[..., columns] = normals @ half
-    total.F.index_add_(0, of, along)
-    half, right = half.flatten(0, 1), right.flatten()
-    places = columns[:, None] * len(total.g) + columns
-    total.H.view(-1).index_add_(0, places.flatten(), (half.T @ half).flatten(), alpha=-1)
-    total.g[columns] -= half.T @ right
+    return Blocks(hessian, gradient * free, free)
 
 
 def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: OfLaw) -> Tensor:
     """dm of the Schur complement. solved: grazing, bounce, gleam."""
     H, g = _lights_equations(sums, layout)
     moved, A = patches.moved(vertices.normal)
-    reduced = _eliminated(sums, _blocks(sums, vertices, anchor), layout, A, patches)
+    derivatives = [*(sums.cross[rig].flatten(2) for rig in range(len(layout.lights))), sums.vertices[:, : -OF_LAW - 1, -OF_LAW - 1 : -1]]
+    reduced = eliminated(derivatives, _blocks(sums, vertices, anchor), A, patches)
     H, g, F, f = H + reduced.H, g + reduced.g, reduced.F, reduced.f
     of_patches = torch.linalg.solve(reduced.E, torch.cat([F, (f - patches.summed(moved))[..., None]], 2))
     H += torch.einsum("kim,kin->mn", F, of_patches[..., :-1])
@@ -287,7 +213,7 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     wanted = torch.cat([torch.full((len(g) - OF_LAW,), True), torch.tensor(solved)]).nonzero()[:, 0].to(g.device)
     step = torch.zeros_like(g)
     if len(wanted):
-        step[wanted] = -torch.linalg.solve(H[wanted][:, wanted], g[wanted])
+        step[wanted] = -damped_solution(H[wanted][:, wanted], g[wanted])
     return step
 
 
