@@ -36,15 +36,17 @@ def test_the_reduced_system_is_that_of_the_whole_matrix(monkeypatch: pytest.Monk
     unused = torch.zeros(n, 3)
     patches = Patches(torch.arange(n), of, unused, unused, unused[:, 0], unused[:, :2])
 
-    found = eliminated(derivatives, blocks, A, patches)
+    m = sum(d.shape[2] for d in derivatives)
+    before = drawn(m, m).double(), drawn(m).double()
+    found = eliminated(before[0].clone(), before[1].clone(), derivatives, blocks, A, patches)
 
     inverse = torch.linalg.inv(hessian.double())
     cross = (torch.cat(derivatives, 2) * free[..., None]).double()
     to_patch = torch.nn.functional.one_hot(of).double()
     gradient = blocks.gradient.double()
     expected = (
-        -torch.einsum("jpm,jpq,jqn->mn", cross, inverse, cross),
-        -torch.einsum("jpm,jpq,jq->m", cross, inverse, gradient),
+        before[0] - torch.einsum("jpm,jpq,jqn->mn", cross, inverse, cross),
+        before[1] - torch.einsum("jpm,jpq,jq->m", cross, inverse, gradient),
         torch.einsum("jk,jap,jpq,jbq->kab", to_patch, A, inverse[:, :2, :2], A),
         torch.einsum("jk,jap,jpq,jqm->kam", to_patch, A, inverse[:, :2], cross),
         torch.einsum("jk,jap,jpq,jq->ka", to_patch, A, inverse[:, :2], gradient),

@@ -25,8 +25,8 @@ cache, and products are large enough for it."""
 
 @dataclass(frozen=True)
 class Reduced:
-    """What vertices that are eliminated add: H (m, m) and g (m,) to the equations of lights and law; E (k, 2, 2), F (k, 2, m) and f (k, 2)
-    of the patches."""
+    """H (m, m) and g (m,) of the equations of lights and law, less what eliminated vertices take from them; E (k, 2, 2), F (k, 2, m) and
+    f (k, 2) of the patches."""
 
     H: Tensor
     g: Tensor
@@ -77,11 +77,11 @@ def _half(derivatives: Tensor, L: Tensor, free: Tensor, columns: slice) -> _Half
     return _Half(columns, rows, place, torch.linalg.solve_triangular(L, derivatives * free.double()[..., None], upper=False))
 
 
-def eliminated(derivatives: list[Tensor], blocks: Blocks, A: Tensor, patches: Patches) -> Reduced:
-    """Of vertices whose H_jm (V, p, m) comes in parts (V, p, columns): of each rig, then of the law; A (V, 2, 2) as in patches.py."""
+def eliminated(H: Tensor, g: Tensor, derivatives: list[Tensor], blocks: Blocks, A: Tensor, patches: Patches) -> Reduced:
+    """Vertices whose H_jm (V, p, m) comes in parts (V, p, columns), of each rig, then of the law; A (V, 2, 2) as in patches.py. H and g
+    are changed in place: where every view has lights of its own there is no room for copies."""
     count, ends = patches.count, [0, *accumulate(d.shape[2] for d in derivatives)]
-    m = ends[-1]
-    total = Reduced(*(A.new_zeros(*shape) for shape in ((m, m), (m,), (count, 2, 2), (count, 2, m), (count, 2))))
+    total = Reduced(H, g, *(A.new_zeros(count, 2, *shape) for shape in ((2,), (ends[-1],), ())))
     step = max(VERTICES_PER_BLOCK, COLUMNS_PER_BLOCK // max(d.shape[2] for d in derivatives))
     for start in range(0, len(A), step):
         part = slice(start, start + step)

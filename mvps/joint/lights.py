@@ -202,19 +202,20 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     H, g = _lights_equations(sums, layout)
     moved, A = patches.moved(vertices.normal)
     derivatives = [*(sums.cross[rig].flatten(2) for rig in range(len(layout.lights))), sums.vertices[:, : -OF_LAW - 1, -OF_LAW - 1 : -1]]
-    reduced = eliminated(derivatives, _blocks(sums, vertices, anchor), A, patches)
-    H, g, F, f = H + reduced.H, g + reduced.g, reduced.F, reduced.f
-    of_patches = torch.linalg.solve(reduced.E, torch.cat([F, (f - patches.summed(moved))[..., None]], 2))
-    H += torch.einsum("kim,kin->mn", F, of_patches[..., :-1])
-    g += torch.einsum("kim,ki->m", F, of_patches[..., -1])
+    reduced = eliminated(H, g, derivatives, _blocks(sums, vertices, anchor), A, patches)
+    F = reduced.F.flatten(0, 1)
+    of_patches = torch.linalg.solve(reduced.E, torch.cat([reduced.F, (reduced.f - patches.summed(moved))[..., None]], 2)).flatten(0, 1)
+    H.addmm_(F.T, of_patches[:, :-1])
+    g.addmv_(F.T, of_patches[:, -1])
     # The common scale of all lights is free (albedo takes it up): damping keeps it still.
-    diagonal = torch.diagonal(H).clamp_min(0)
-    H += torch.diag(1e-4 * diagonal + 1e-9 * diagonal.max() + torch.finfo(H.dtype).tiny ** 0.5)
-    wanted = torch.cat([torch.full((len(g) - OF_LAW,), True), torch.tensor(solved)]).nonzero()[:, 0].to(g.device)
-    step = torch.zeros_like(g)
-    if len(wanted):
-        step[wanted] = -damped_solution(H[wanted][:, wanted], g[wanted])
-    return step
+    diagonal = torch.diagonal(H)
+    positive = diagonal.clamp_min(0)
+    diagonal += 1e-4 * positive + 1e-9 * positive.max() + torch.finfo(H.dtype).tiny ** 0.5
+    # What is not solved for stays: its row and column become the identity's, whatever is nothing to the others.
+    still = torch.cat([torch.zeros(len(g) - OF_LAW, dtype=torch.bool), ~torch.tensor(solved)]).to(g.device)
+    H[still], H[:, still], g[still] = 0, 0, 0
+    diagonal[still] = 1
+    return -damped_solution(H, g)
 
 
 def told_by_shadows(
