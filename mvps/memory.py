@@ -1,11 +1,13 @@
 """How much memory a reconstruction takes, and how many views at a time keep it below a limit.
 
     peak = program + HELD + PIXEL pixels + KEPT samples + views at a time * IN_WORK samples of the largest view
-           + max(VERTEX vertices + sent, 3 sent),    sent = views at a time * SENT sending * most lights of a view
+           + max(VERTEX vertices + sent, 3 sent, LIGHT lights + PAIR lights^2 + sent)
+    sent = views at a time * SENT sending * most lights of a view
 
 program: what it takes with its libraries, which their build decides (torch for the CPU 0.3 GB, for CUDA 0.6); pixels: of all masks;
 samples: pixels times lights; vertices: of the last mesh; sending: patches that light others by lobes (gleam.py), known when lobes are; in
-grey while vertices are solved, in three channels while textures are made. Before there is one its area is known from the masks, four times
+grey while vertices are solved, in three channels while textures are made; lights: those that are solved for together, of all views where
+every view has its own. Before there is one its area is known from the masks, four times
 the mean projection of a convex body (Cauchy 1832), and DENSITY says how many vertices a preset is likely to put on a pixel's area. Creases
 may ask for more, so every mesh is looked at again. Sizes are in bytes, measured as the largest resident set (docs/findings/cost.md).
 """
@@ -36,6 +38,9 @@ IN_WORK = 25.0
 SENT = 45.0
 """What a patch sends in one channel under a light by way of three lobes: five terms of four bytes, and what makes them."""
 
+LIGHT, PAIR = 288e3, 216.0
+"""Derivatives of 4000 vertices, six unknowns each, by a light's three, in float32; three matrices of 3 by 3 in float64."""
+
 DENSITY = {"draft": 0.35, "standard": 0.8, "fine": 2.8}
 """Vertices over the area in pixels. In `standard` 0.67 and 0.73 on two captures, 2.3 and 2.7 on two that are creased all over."""
 
@@ -60,12 +65,12 @@ def keep_freed() -> None:
             mallopt(option, value)
 
 
-def peak_bytes(program: float, sizes: Sequence[tuple[int, int]], vertices: float, views: int, sending: int = 0) -> float:
+def peak_bytes(program: float, sizes: Sequence[tuple[int, int]], vertices: float, views: int, sending: int = 0, lights: int = 0) -> float:
     """The largest resident set to expect for views of `sizes` (pixels of the mask, lights), with so many `views` at a time."""
-    pixels, samples = sum(of_mask for of_mask, _ in sizes), [of_mask * lights for of_mask, lights in sizes]
-    sent = views * SENT * sending * max(lights for _, lights in sizes)
+    pixels, samples = sum(of_mask for of_mask, _ in sizes), [of_mask * count for of_mask, count in sizes]
+    sent = views * SENT * sending * max(count for _, count in sizes)
     held = program + HELD + PIXEL * pixels + KEPT * sum(samples) + views * IN_WORK * max(samples)
-    return held + max(VERTEX * vertices + sent, 3 * sent)
+    return held + max(VERTEX * vertices + sent, 3 * sent, LIGHT * lights + PAIR * lights**2 + sent)
 
 
 def likely_vertices(sizes: Sequence[tuple[int, int]], preset: str) -> float:
@@ -80,14 +85,16 @@ def keep_below(gigabytes: float, program: float, sizes: Sequence[tuple[int, int]
     room_for(likely_vertices(sizes, preset))
 
 
-def room_for(vertices: float, sending: int = 0) -> None:
-    """Work on no more views at a time than the limit, where there is one, allows beside a mesh. CaptureError where one is too many."""
+def room_for(vertices: float, sending: int = 0, lights: int = 0) -> None:
+    """Work on no more views at a time than the limit, where there is one, allows beside a mesh, what its patches send and the lights' own
+    equations. CaptureError where one is too many."""
     for limit, program, sizes in _limit:
-        fits = [views for views in range(1, at_a_time() + 1) if peak_bytes(program, sizes, vertices, views, sending) <= limit]
+        fits = [views for views in range(1, at_a_time() + 1) if peak_bytes(program, sizes, vertices, views, sending, lights) <= limit]
         if not fits:
-            least, most = peak_bytes(program, sizes, vertices, 1, sending) / 1e9, max(lights for _, lights in sizes)
+            least, most = peak_bytes(program, sizes, vertices, 1, sending, lights) / 1e9, max(count for _, count in sizes)
+            together = f" whose {lights} lights are solved for together" if lights > most else ""
             raise CaptureError(
-                f"--max-memory: wanted at least {least + 0.05:.1f} GB for {len(sizes)} views of up to {most} lights and a mesh of about"
-                f" {vertices:.0f} vertices, given {limit / 1e9:g}; use fewer --views or --lights, or a quicker --preset"
+                f"--max-memory: wanted at least {least + 0.05:.1f} GB for {len(sizes)} views of up to {most} lights{together} and a mesh of"
+                f" about {vertices:.0f} vertices, given {limit / 1e9:g}; use fewer --views or --lights, or a quicker --preset"
             )
         work_on(fits[-1])

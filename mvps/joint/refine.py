@@ -206,7 +206,7 @@ def refine(
     while pending:
         round_settings = pending.pop(0)
         state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
-        room_for(len(state.surface.vertices))
+        room_for(len(state.surface.vertices), lights=state.lights.different if settings.free_lights else 0)
         if np.isfinite(round_settings.crease) and creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
