@@ -18,7 +18,7 @@ import ctypes
 from collections.abc import Sequence
 
 from mvps.cores import at_a_time, work_on
-from mvps.scene import CaptureError
+from mvps.scene import CaptureError, Lights
 
 HELD = 185e6
 """What the allocator keeps of work that is done."""
@@ -83,6 +83,12 @@ def keep_below(gigabytes: float, program: float, sizes: Sequence[tuple[int, int]
     cannot be, as far as the masks tell."""
     _limit[:] = [(1e9 * gigabytes, program, sizes)]
     room_for(likely_vertices(sizes, preset))
+
+
+def solved_together(lights: Lights) -> int:
+    """How many lights one system of equations has: those of the rig, or of all views where they are not one rig's."""
+    of_views = [len(intensity) for intensity in lights.intensity]
+    return max(of_views) if lights.one_rig else sum(of_views)
 
 
 def room_for(vertices: float, sending: int = 0, lights: int = 0) -> None:

@@ -175,12 +175,6 @@ class Lights:
             if (intensity <= 0).any():
                 raise ValueError(f"light intensity: wanted positive numbers, given {float(intensity.min()):.4g}")
 
-    @property
-    def different(self) -> int:
-        """Number of lights: those of the rig, or of all views where they are not one rig's."""
-        of_views = [len(intensity) for intensity in self.intensity]
-        return max(of_views) if self.one_rig else sum(of_views)
-
 
 @dataclass(frozen=True, eq=False)
 class Capture:

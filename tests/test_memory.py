@@ -8,14 +8,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mvps import cores, memory, reconstruct
 from mvps.command import run
 from mvps.cores import at_a_time, on_cores, one_by_one, work_on
 from mvps.load import read_capture
-from mvps.memory import keep_below, likely_vertices, peak_bytes, room_for
-from mvps.scene import CaptureError
+from mvps.memory import keep_below, likely_vertices, peak_bytes, room_for, solved_together
+from mvps.scene import CaptureError, Lights
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -79,6 +80,13 @@ def test_lights_of_their_own_take_room() -> None:
         room_for(vertices, lights=1920)
     more = float(str(refused.value).split("at least ")[1].split()[0]) - peak_bytes(PROGRAM, SIZES, 0, 1) / 1e9
     assert abs(more - 1.35) < 0.1
+
+
+@pytest.mark.parametrize(("one_rig", "together"), [(True, 3), (False, 5)])
+def test_lights_of_one_rig_are_the_same_in_all_views(one_rig: bool, together: int) -> None:
+    towards = np.array([[0.0, 0.0, 1.0]])
+    lights = Lights(tuple(towards.repeat(n, 0) for n in (3, 2)), tuple(np.ones((n, 3)) for n in (3, 2)), one_rig)
+    assert solved_together(lights) == together
 
 
 def test_light_by_way_of_lobes_takes_room() -> None:

@@ -36,7 +36,7 @@ from mvps.joint.stated import stated_errors
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
-from mvps.memory import room_for
+from mvps.memory import room_for, solved_together
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.noise import dark_noise_share
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
@@ -206,7 +206,7 @@ def refine(
     while pending:
         round_settings = pending.pop(0)
         state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
-        room_for(len(state.surface.vertices), lights=state.lights.different if settings.free_lights else 0)
+        room_for(len(state.surface.vertices), lights=solved_together(state.lights) if settings.free_lights else 0)
         if np.isfinite(round_settings.crease) and creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)
