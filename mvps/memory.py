@@ -7,9 +7,9 @@
 program: what it takes with its libraries, which their build decides (torch for the CPU 0.3 GB, for CUDA 0.6); pixels: of all masks;
 samples: pixels times lights; vertices: of the last mesh; sending: patches that light others by lobes (gleam.py), known when lobes are; in
 grey while vertices are solved, in three channels while textures are made; lights: those that are solved for together, of all views where
-every view has its own. Before there is one its area is known from the masks, four times
-the mean projection of a convex body (Cauchy 1832), and DENSITY says how many vertices a preset is likely to put on a pixel's area. Creases
-may ask for more, so every mesh is looked at again. Sizes are in bytes, measured as the largest resident set (docs/findings/cost.md).
+every view has its own. Before there is a mesh its area is known from the masks, four times the mean projection of a convex body (Cauchy
+1832), and DENSITY says how many vertices a preset is likely to put on a pixel's area. Creases may ask for more, so every mesh is looked at
+again. Sizes are in bytes, measured as the largest resident set (docs/findings/cost.md).
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     diagonal = torch.diagonal(H)
     positive = diagonal.clamp_min(0)
     diagonal += 1e-4 * positive + 1e-9 * positive.max() + torch.finfo(H.dtype).tiny ** 0.5
-    # What is not solved for stays: its row and column become the identity's, whatever is nothing to the others.
+    # What is not solved for stays: its row and column become the identity's.
     still = torch.cat([torch.zeros(len(g) - OF_LAW, dtype=torch.bool), ~torch.tensor(solved)]).to(g.device)
     H[still], H[:, still], g[still] = 0, 0, 0
     diagonal[still] = 1
