@@ -10,11 +10,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from sphere_scene import make_sphere
 
 from mvps import cores, memory, reconstruct
 from mvps.command import run
 from mvps.cores import at_a_time, on_cores, one_by_one, work_on
+from mvps.joint.blocks import Vertices
+from mvps.joint.state import State, senders_of
 from mvps.load import read_capture
+from mvps.material import LARGEST
 from mvps.memory import keep_below, likely_vertices, peak_bytes, room_for, solved_together
 from mvps.scene import CaptureError, Lights
 from mvps.synthetic.files import write_capture
@@ -159,3 +164,16 @@ print(sum(faults() for _ in range(4)))
 """
     without, kept = (int(subprocess.check_output([sys.executable, "-c", program, *options])) for options in ([], ["keep"]))
     assert kept < 2048 < without
+
+
+def test_what_sends_light_on_makes_no_room_that_lights_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Asked when patches are known, after the mesh was."""
+    asked = []
+    monkeypatch.setattr("mvps.joint.state.room_for", lambda *of: asked.append(of))
+    scene = make_sphere(2)
+    state = State(
+        scene.reconstruction.surface, scene.reconstruction.lights, (), scene.reconstruction.material.law, LARGEST, 0.0, together=960
+    )
+    n = len(state.surface.vertices)
+    senders_of(state, Vertices(torch.zeros(n, 3), torch.ones(n, 2), torch.ones(n)))
+    assert asked == [(n, 0, 960)]

@@ -199,14 +199,15 @@ def refine(
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     pixel = surface_pixel(capture, surface)
-    state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture))
+    together = solved_together(lights) if settings.free_lights else 0
+    state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), together=together)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
     repeats = 0
     while pending:
         round_settings = pending.pop(0)
         state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
-        room_for(len(state.surface.vertices), lights=solved_together(state.lights) if settings.free_lights else 0)
+        room_for(len(state.surface.vertices), lights=state.together)
         if np.isfinite(round_settings.crease) and creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)

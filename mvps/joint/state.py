@@ -24,7 +24,7 @@ from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, Norm
 class State:
     """What one round hands to the next. noise: of dark pixels (noise.py); under: the photographs, perhaps thinned, that `views` are samples
     of, and their lights; lobed: whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and
-    with them, once asked for."""
+    with them, once asked for; together: lights that are solved for at once (memory.py)."""
 
     surface: Surface
     lights: Lights
@@ -38,6 +38,7 @@ class State:
     views: list[ViewSamples] = field(default_factory=list)
     under: tuple[Capture, Lights] | None = None
     trials: list[Trial] = field(default_factory=list)
+    together: int = 0
 
 
 def senders_of(state: State, vertices: Vertices) -> Senders | None:
@@ -46,7 +47,7 @@ def senders_of(state: State, vertices: Vertices) -> Senders | None:
         return None
     if state.lobed not in state.gathers:
         of = state.gathers[state.lobed] = patches_of(state.surface, state.lobed)
-        room_for(len(state.surface.vertices), len(of.normal) * state.lobed)
+        room_for(len(state.surface.vertices), len(of.normal) * state.lobed, state.together)
     albedo, weight = reflectance_of(vertices)
     return senders(state.gathers[state.lobed], state.surface, state.law, albedo, weight if state.lobed else None)
 
