@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from accuracy import COLUMNS, HERE, machines, table
 from hard.cases import Sample
+from hard.lumps import lumps
 from hard.scenes import rendered, shaped_as
 from hard.traced import BOUNCES, SHAPES, surface_of, traced
 from hard_cases import run_one
@@ -28,9 +29,10 @@ SHOWN = [column for column in COLUMNS if column[0] not in LEFT_OUT]
 
 
 class Case(NamedTuple):
-    """shape and material of hard/traced.py; settings of the photographs; direct: without light between surfaces."""
+    """shape and material of hard/traced.py, or the seed of lumps by chance (hard/lumps.py); settings of the photographs; direct: without
+    light between surfaces."""
 
-    shape: str
+    shape: str | int
     material: str
     settings: SceneSettings = SceneSettings()
     direct: bool = False
@@ -51,12 +53,27 @@ CASES = {
     "cheese-chalk": Case("cheese", "chalk", SceneSettings(seed=15)),
     "bricks-plastic": Case("bricks", "plastic", SceneSettings(seed=16)),
     "statue-chalk": Case("statue", "chalk", SceneSettings(seed=31)),
+    "lumps-plastic": Case(101, "plastic", SceneSettings(seed=41, views=12, lights=16, size=192)),
+    "lumps-lacquer": Case(102, "lacquer", SceneSettings(seed=42, views=8, lights=10, free_lights=True)),
+    "lumps-patina": Case(103, "patina", SceneSettings(seed=43)),
+    "lumps-gold": Case(104, "gold", SceneSettings(seed=44, views=16, lights=20)),
+    "lumps-dark": Case(105, "dark", SceneSettings(seed=45)),
+    "lumps-cloth": Case(106, "cloth", SceneSettings(seed=46, views=20, lights=6, free_lights=True)),
+    "coral-plastic": Case("coral", "plastic", SceneSettings(seed=47, views=14, size=200)),
+    "vessel-chalk": Case("vessel", "chalk", SceneSettings(seed=48)),
+    "cheese-lacquer": Case("cheese", "lacquer", SceneSettings(seed=49, views=8, lights=24)),
+    "gear-plastic": Case("gear", "plastic", SceneSettings(seed=61)),
+    "mug-plastic": Case("mug", "plastic", SceneSettings(seed=62)),
+    "nut-lacquer": Case("nut", "lacquer", SceneSettings(seed=63)),
+    "coin-patina": Case("coin", "patina", SceneSettings(seed=64)),
+    "steps-cloth": Case("steps", "cloth", SceneSettings(seed=65)),
+    "gear-copper": Case("gear", "copper", SceneSettings(seed=66)),
 }
 
 
 def made(case: Case) -> Sample:
     """The capture and its truth."""
-    surface = surface_of(SHAPES[case.shape]())
+    surface = surface_of(SHAPES[case.shape]()) if isinstance(case.shape, str) else lumps(case.shape)
     scene = shaped_as(surface, case.settings)
     take = traced(scene.surface, case.material, 2 if case.direct else BOUNCES)
     capture, truth = rendered(case.settings, lambda _: scene, take)

@@ -144,14 +144,13 @@ def coarse(
 ) -> tuple[Refined, list[dict[str, float]]]:
     """Shape, lights and normals for the last rounds to start from, and the rounds that they took, moves in pixels of `used`. Of large
     photographs at half their size, or less; what is found there is pulled to what each larger level but the last shows."""
-    from mvps.material import POOR_FIT
     from mvps.plan import carving_pass, first_pass
 
     sizes = half_sizes(used, progress)
     level = sizes.pop()
     begun, plan = begin(level, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
     rough = step("first refinement", lambda: stage_two("first refinement", level, begun.surface, begun, plan, settings, progress))
-    turns = parts.of(carving_pass(lights is None, rough.rounds[-1]["residual"] <= POOR_FIT))
+    turns = parts.of(carving_pass(lights is None))
     found: Refined
     found, rounds = step("shape", lambda: shaped(level, begun.grid, rough, settings, turns, progress))
     rounds = in_pixels(rounds, 2 ** len(sizes))

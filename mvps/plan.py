@@ -65,14 +65,14 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True, detail=final)
 
 
-COARSE = RoundSettings(2.0, 2.4, 0.4, carving=True)
+COARSE = RoundSettings(2.0, 2.4, 0.4, still=STILL_PIXELS, carving=True)
 """A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""
 
 
-def carving_pass(free_lights: bool, fits: bool) -> RefineSettings:
+def carving_pass(free_lights: bool) -> RefineSettings:
     """What comes after Stage I: lights and normals on its surface, and hollows dug as deep as photographs tell, until vertices lie still
-    where the model fits; where it does not, single photographs pull them elsewhere, and Stage I has a turn first."""
-    return RefineSettings((replace(COARSE, still=STILL_PIXELS) if fits else COARSE,), free_lights=free_lights, half=True)
+    where the model fits; where it does not, Stage I has a turn first."""
+    return RefineSettings((COARSE,), free_lights=free_lights, half=True)
 
 
 def once(plan: RefineSettings) -> RefineSettings:
@@ -89,5 +89,5 @@ def last_pass(preset: str, free_lights: bool, far: bool) -> RefineSettings:
         "fine": (first, replace(first, edge=1.0)),
     }[preset]
     if far:
-        rounds = (replace(COARSE, still=STILL_PIXELS), *rounds)
+        rounds = (COARSE, *rounds)
     return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)

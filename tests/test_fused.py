@@ -88,6 +88,16 @@ def test_a_blurred_ridge_is_sharpened(away: float) -> None:
     assert angles_deg(found[near], true[near]).mean() < 0.65 * angles_deg(blurred[near], true[near]).mean()
 
 
+def test_a_sharpened_ridge_does_not_overshoot() -> None:
+    """Beside it the sides keep their slope, however much blur is believed to be there."""
+    ridge, x, inner = sheet(-np.abs(X))
+    blurred = normalise(np.stack([erf(x / (0.6 * np.sqrt(2))), 0 * x, np.ones_like(x)], 1))
+    everywhere = np.ones(len(x))
+    found = _without_blur(blurred, 2.0 * everywhere, 0 * everywhere, everywhere > 0, ridge)
+    slope = np.abs(found[:, 0] / found[:, 2])[inner]
+    assert slope.max() < 1.01 and np.median(slope) > 0.99
+
+
 def test_what_is_error_alone_is_not_sharpened() -> None:
     flat, x, inner = sheet(0 * X)
     up = np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))

@@ -137,7 +137,7 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
     monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
     monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
     found = refined()
-    best, rounds = hollowed(capture, None, found, Settings("somewhere"), carving_pass(True, True), None)  # type: ignore[arg-type]
+    best, rounds = hollowed(capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
     assert next(counted) - 2 == made and len(rounds) == kept
     # Pits are dug on after a round each; where Stage I has been, vertices come to rest.
     assert repeated in ({}, {"hollows": {False}, "coarse refinement": {True}})
@@ -188,7 +188,7 @@ def test_pits_stay_that_halve_what_is_left_unexplained_in_them(
     monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
     monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
     found, grid = refined(), SignedDistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 2.0)
-    best, rounds = pitted(capture, grid, found, Settings("somewhere"), carving_pass(True, True), None)  # type: ignore[arg-type]
+    best, rounds = pitted(capture, grid, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
     assert next(counted) - 2 == made and len(rounds) == kept and (best is found) == (kept == 0)
 
 
@@ -210,7 +210,7 @@ def test_a_vessel_is_hollow() -> None:
     settings = SceneSettings(views=8, lights=6, size=80)
     scene, run = vessel(settings), Settings("cup")
     capture, _ = render_capture(settings, scene)
-    begun, plan = begin(capture, capture, run, scene.lights, Parts(), Progress()), carving_pass(False, True)
+    begun, plan = begin(capture, capture, run, scene.lights, Parts(), Progress()), carving_pass(False)
     bridged = stage_two("coarse refinement", capture, begun.surface, begun, plan, run, Progress())
     found, rounds = hollowed(capture, begun.grid, bridged, run, plan, Progress())
     top = scene.surface.vertices[:, 2].max()

@@ -51,3 +51,9 @@ def test_a_round_is_done_again_until_vertices_are_still(scene: SphereScene) -> N
     (first,), _ = swollen(scene, 0.5)
     changes, _ = swollen(scene, 0.5, still=0.9 * first)
     assert changes[0] == first and len(changes) == 2 and changes[1] <= 0.9 * first
+
+
+def test_of_a_model_that_does_not_fit_no_round_is_done_again(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    (first,), _ = swollen(scene, 0.5)
+    monkeypatch.setattr(rounds, "POOR_FIT", 0.0)
+    assert len(swollen(scene, 0.5, still=0.9 * first)[0]) == 1

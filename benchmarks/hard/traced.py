@@ -9,6 +9,11 @@ Shapes are zero sets of functions f of x in the unit ball, negative inside; s(f,
     shell     a ball with spiral ridges
     cheese    a ball with round hollows
     bricks    three blocks on each other: all sides flat
+    gear      fourteen teeth with upright sides, a hub with a bore
+    mug       a cup with a handle, deeper than wide
+    nut       six sides, chamfers, a bore with a thread
+    coin      a disc with a rim, in it a net of low bumps
+    steps     four discs on each other
 
 A photograph is the radiance of paths up to BOUNCES segments under one directional light, PATHS of them a sub-pixel; imported only where
 Mitsuba is there (pip install mvps[mitsuba]).
@@ -150,6 +155,55 @@ def bricks(x: Float) -> Float:
     return np.asarray(np.min([block(x, *one) for one in blocks], axis=0))
 
 
+def round_z(x: Float) -> Float:
+    """Distance (n,) to the z axis."""
+    return np.asarray(np.hypot(x[:, 0], x[:, 1]))
+
+
+def disc(x: Float, radius: float, middle: float, half: float) -> Float:
+    """A cylinder around the z axis, 2 half high about `middle`."""
+    return np.asarray(np.maximum(round_z(x) - radius, np.abs(x[:, 2] - middle) - half))
+
+
+def gear(x: Float) -> Float:
+    """A wheel whose teeth have flanks as steep as the grid lets them be."""
+    rim = 0.62 + 0.11 * np.clip(3 * np.cos(14 * np.arctan2(x[:, 1], x[:, 0])), -1, 1)
+    wheel = np.maximum((round_z(x) - rim) * 0.6, np.abs(x[:, 2]) - 0.18)
+    return np.asarray(np.maximum(np.minimum(wheel, disc(x, 0.3, 0, 0.36)), 0.14 - round_z(x)))
+
+
+def mug(x: Float) -> Float:
+    """A cup, its handle a ring in the plane of the x and z axes."""
+    d = x - np.array([0.55, 0, 0])
+    handle = np.hypot(np.hypot(d[:, 0], d[:, 2]) - 0.28, d[:, 1]) - 0.07
+    inside = np.maximum(round_z(x) - 0.42, -0.5 - x[:, 2])
+    return np.asarray(np.maximum(np.minimum(disc(x, 0.5, 0, 0.6), handle), -inside))
+
+
+def nut(x: Float) -> Float:
+    """A hexagonal nut."""
+    towards, radius = np.array([0, 1, 2]) * np.pi / 3, round_z(x)
+    sides = (np.abs(x[:, 0, None] * np.cos(towards) + x[:, 1, None] * np.sin(towards)) - 0.6).max(1)
+    thread = 0.3 + 0.03 * np.sin(2 * np.pi * x[:, 2] / 0.16 + np.arctan2(x[:, 1], x[:, 0]))
+    chamfer = (radius + np.abs(x[:, 2]) * 1.7 - 1.25) * 0.5
+    return np.asarray(np.max([sides, np.abs(x[:, 2]) - 0.4, chamfer, (thread - radius) * 0.7], axis=0))
+
+
+def coin(x: Float) -> Float:
+    """A thick coin."""
+    rim = np.maximum(np.abs(round_z(x) - 0.74) - 0.05, np.abs(x[:, 2]) - 0.12)
+    net = 0.09 - 0.2 * np.abs(np.sin(9 * x[:, 0]) * np.sin(9 * x[:, 1]))
+    bumps = np.maximum(net, np.maximum(np.abs(x[:, 2]) - 0.11, round_z(x) - 0.6))
+    return np.asarray(np.min([disc(x, 0.8, 0, 0.08), rim, bumps], axis=0))
+
+
+def steps(x: Float) -> Float:
+    """A turned piece."""
+    return np.asarray(
+        np.min([disc(x, *of) for of in ((0.6, -0.6, 0.15), (0.45, -0.35, 0.15), (0.22, 0.1, 0.45), (0.42, 0.55, 0.1))], axis=0)
+    )
+
+
 SHAPES: dict[str, Callable[[], Function]] = {
     "statue": lambda: statue,
     "knot": knot,
@@ -158,6 +212,11 @@ SHAPES: dict[str, Callable[[], Function]] = {
     "shell": lambda: shell,
     "cheese": lambda: cheese,
     "bricks": lambda: bricks,
+    "gear": lambda: gear,
+    "mug": lambda: mug,
+    "nut": lambda: nut,
+    "coin": lambda: coin,
+    "steps": lambda: steps,
 }
 
 

@@ -7,8 +7,8 @@ The miss e of coherence.py counts where it is positive. Over all outline points 
 is made small by damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963), rho Cauchy's. Cameras start within about the misfit of where
 they belong, which is the second term.
 
-Every other point is held out. Points near each other see the same frontier, so a pose that is wrong shows in both halves; a mask's
-staircase does not.
+Outlines are cut into quarters, and two that do not touch are held out. A pose that is wrong shows in both halves; a mask's staircase does
+not, which a straight edge has along all of its length.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ LEAST_SPACING, MOST_POINTS = 4.0, 2000
 """Pixels between outline points: beyond three the smoothed staircase of a mask (silhouette.py) is another. Points of all views: a tenth of
 a second to follow their lines of sight through twenty views."""
 
-APART = 2
-"""Of the points that find a misfit every second is left out: neighbours' misses hang on the same pixels of another view's outline."""
+PARTS = 4
+"""Of a view's outline: with points of both halves beside each other right cameras of blocks and nuts were moved, with eighths of blocks too
+(docs/findings/checks.md)."""
 
 FIRST_DAMPING = 1.0
 """Of the motions, in equations of a pixel: a camera moves by no more than its outline's points ask for together."""
@@ -51,9 +52,15 @@ class Outlines:
     body: Object
     points: list[Float]
 
-    def every(self, stride: int, start: int = 0) -> Outlines:
-        """Only every stride-th point of each view from `start` on."""
-        return Outlines(self.cameras, self.fields, self.body, [of_view[start::stride] for of_view in self.points])
+    def half(self, which: int) -> Outlines:
+        """Only every other part of each view's outline: the odd or the even ones."""
+
+        def of(points: Float) -> Float:
+            part = np.arange(len(points)) * PARTS // max(len(points), 1)
+            chosen: Float = points[part % 2 == which]
+            return chosen
+
+        return Outlines(self.cameras, self.fields, self.body, [of(points) for points in self.points])
 
     def after(self, motions: Float) -> list[Camera]:
         """The cameras after motions (views, 6)."""
@@ -140,7 +147,7 @@ def fitted(outlines: Outlines, motions: Float, tie: float, bound: float) -> Floa
 def by_other_half(outlines: Outlines) -> tuple[float, float]:
     """By how much the positive misses of every half of the points fall, mean in pixels, after one step that the other half asks for, and
     the standard error of that."""
-    halves, still = [outlines.every(2 * APART, k * APART) for k in range(2)], np.zeros((len(outlines.cameras), UNKNOWNS))
+    halves, still = [outlines.half(k) for k in range(2)], np.zeros((len(outlines.cameras), UNKNOWNS))
     before = [half.misses(still) for half in halves]
     asked = [step(half, still, found, tie_of(found)) for half, found in zip(halves, before, strict=True)]
     after = [half.misses(motions) for half, motions in zip(halves, reversed(asked), strict=True)]

@@ -1,7 +1,8 @@
 """Poses from photographs: a quick reconstruction, and cameras moved until its photographs agree (mvps/joint/bundle.py).
 
 In turn, because lights, shape and poses are solved from each other. Cameras are moved by one part of the lights, and stay moved where the
-model that comes of it predicts another part of the lights better.
+model that comes of it predicts another part of the lights better. So do those that silhouettes moved: a mask is off by the same part of a
+pixel all along a straight edge, and right cameras of blocks would follow it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from mvps.joint.thinned import ENOUGH_LIGHTS, thinned
 from mvps.material import CERTAIN, LARGEST, gained
 from mvps.motions import Object, with_motions
 from mvps.photometric import normal_maps
-from mvps.scene import Capture, Law
+from mvps.scene import Capture, Float, Law, Lights
 
 TURNS = 2
 """Of the quick reconstruction and the cameras: what is left after two is within what photographs tell (docs/findings/checks.md)."""
@@ -45,17 +46,38 @@ def quick_model(capture: Capture, device: Device) -> Model:
     return Model(surface, refined.lights, vertices, replace(refined.law, bounce=0.0, gleam=0.0), among)
 
 
+def tells(capture: Capture) -> bool:
+    """Whether views have lights enough for two parts."""
+    return min(len(view.lights) for view in capture.views) >= 2 * MINIMUM_LIGHTS
+
+
+def parts(capture: Capture, model: Model) -> tuple[tuple[Capture, Lights], tuple[Capture, Lights]]:
+    """Photographs and lights by which vertices are solved, and those that are held out."""
+    stride = max(2, round(min(len(view.lights) for view in capture.views) / ENOUGH_LIGHTS))
+    return part(capture, model.lights, 0, stride), part(capture, model.lights, 1, stride)
+
+
+def confirmed(capture: Capture, body: Object, motions: Float) -> bool:
+    """Whether held-out lights are predicted better by cameras after motions (views, 6); yes where views have too few lights to
+    tell."""
+    if not tells(capture):
+        return True
+    model = quick_model(capture, chosen_device("cpu"))
+    (fit, lights), (held, their_lights) = parts(capture, model)
+    errors = []
+    for by in (np.zeros_like(motions), motions):
+        vertices = solved(with_motions(fit, body, by), lights, model)[1]
+        errors.append(prediction_errors(with_motions(held, body, by), their_lights, vertices))
+    return gained(*errors)[0] > 0
+
+
 def by_photographs(capture: Capture, body: Object) -> tuple[Capture, list[float]]:
     """The capture with its cameras moved, and by which factor the errors of held-out lights fell in each turn that was kept; as it was
     where views have too few lights or nothing was gained."""
-    least = min(len(view.lights) for view in capture.views)
-    if least < 2 * MINIMUM_LIGHTS:
-        return capture, []
-    stride, device, factors = max(2, round(least / ENOUGH_LIGHTS)), chosen_device("cpu"), []
-    for _ in range(TURNS):
-        model = quick_model(capture, device)
-        fit, lights = part(capture, model.lights, 0, stride)
-        held, their_lights = part(capture, model.lights, 1, stride)
+    factors = list[float]()
+    for _ in range(TURNS if tells(capture) else 0):
+        model = quick_model(capture, chosen_device("cpu"))
+        (fit, lights), (held, their_lights) = parts(capture, model)
         _, before = solved(fit, lights, model)
         motions, after = aligned(fit, lights, before, body)
         moved = with_motions(held, body, motions)

@@ -2,7 +2,8 @@
 
 Found where one step of all cameras that half of the outline points asks for lowers the misses of the other half by more than CERTAIN
 standard errors, both ways taken together (outlines.py). Then cameras move by one half of the points until it misses least, which has to
-lower the other half's misses again; from there by all points; and then by the photographs (photographed.py).
+lower the other half's misses again; from there by all points, if photographs are then predicted better; and last by the photographs
+(photographed.py).
 
 The mean pose stays: a motion of the whole world shows in no photograph. A principal point that is off in all views is a shift of the
 object in every camera's frame; the part of it that is no motion of the world is undone by the cameras.
@@ -14,7 +15,7 @@ import numpy as np
 
 from mvps.camera import project
 from mvps.checks.outlines import MASK_NOISE, Outlines, by_other_half, fallen, fitted, misfit, outlines_of, positive, tie_of
-from mvps.checks.photographed import by_photographs
+from mvps.checks.photographed import by_photographs, confirmed
 from mvps.finding import Finding
 from mvps.material import CERTAIN
 from mvps.mesh import lengths
@@ -54,7 +55,10 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
             return capture, []
         text = f"{seen}, and moving the cameras does not mend it: masks or calibration are wrong in another way; check both"
         return capture, [Finding("pose", "all views", text, False)]
-    mended, factors = by_photographs(with_motions(capture, outlines.body, motions), outlines.body)
+    followed = confirmed(capture, outlines.body, motions)
+    mended, factors = by_photographs(with_motions(capture, outlines.body, motions) if followed else capture, outlines.body)
+    if mended is capture:
+        return capture, []
     shift = displacement(capture, mended, outlines.body)
     text = f"{seen}; cameras were moved by {np.median(shift):.2f} px (median; at most {shift.max():.2f}), which leaves"
     text += f" {misfit(outlines_of(mended).misses(still)):.2f} px"
@@ -73,9 +77,9 @@ def by_silhouettes(outlines: Outlines, still: Float) -> Float | None:
 
     No camera moves by more than the largest miss.
     """
-    found, held = outlines.misses(still), outlines.every(2, 1)
+    found, held = outlines.misses(still), outlines.half(1)
     tie, bound = tie_of(found), float(positive(found).max())
-    motions = fitted(outlines.every(2), still, tie, bound)
+    motions = fitted(outlines.half(0), still, tie, bound)
     fall, error = fallen(held.misses(still), held.misses(motions))
     return fitted(outlines, motions, tie, bound) if fall > CERTAIN * error else None
 

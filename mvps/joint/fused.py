@@ -20,11 +20,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import scipy.sparse as sp
 
 from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.joint.pixels import few_lights
-from mvps.joint.sharpened import PIXEL_BLUR, pixel_area, sharpened
+from mvps.joint.sharpened import PIXEL_BLUR, pixel_area, sharpened, within
 from mvps.mesh import face_normals, lengths, normalise
 from mvps.scene import Bool, Capture, Float, Int, NormalMap, Surface
 from mvps.silhouette import sampled
@@ -44,6 +45,9 @@ LEAST_VIEWS = 1.5
 
 ROUNDS = 2
 """Of averaging variances with the faces around."""
+
+PASSES = 2
+"""Of sharpening. Chosen among 1, 2 and 3 (docs/findings/edges.md): a third takes errors for edges."""
 
 
 class FaceNormals(NamedTuple):
@@ -113,7 +117,12 @@ def _without_blur(normal: Float, blur: Float, error: Float, known: Bool, surface
     """Normals (F, 3), unit, without their blur (F,); error (F,) of theirs along a tangent, NaN where not known."""
     centre = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0)
     around, over_some = partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface)
-    return sharpened(normal, centre, blur, error, around, over_some)
+    corners = np.repeat(np.arange(len(normal)), 3), surface.faces.ravel()
+    held = sp.csr_matrix((np.ones(3 * len(normal), np.float32), corners), (len(normal), len(surface.vertices)))
+    beside = held @ held.T
+    for _ in range(PASSES):
+        normal = within(normal, sharpened(normal, centre, blur, error, around, over_some), beside)
+    return normal
 
 
 def _mean_around(values: Float, surface: Surface) -> Float:

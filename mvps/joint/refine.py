@@ -63,12 +63,12 @@ MOST_REPEATS = 2
 
 @dataclass(frozen=True)
 class RoundSettings:
-    """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve
-    lights and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge
-    before it is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY); fusions: faces turn and move, so
-    that other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows; without any the surface
-    stays. still: pixels that vertices may move in the mean before the round is done again. carving: single photographs say where vertices
-    lie, not the pixels' normals, which in a hollow that is too shallow agree where the surface already is."""
+    """One round. edge: mesh edges in pixels; reach: sweep of offsets in pixels, +-; step: of the sweep, pixels; photometric: solve lights
+    and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge before it
+    is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY); fusions: faces turn and move, so that
+    other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows; without any the surface stays.
+    still: pixels that vertices may move in the mean before the round is done again, where the model fits. carving: single photographs
+    say where vertices lie, not the pixels' normals, which in a hollow that is too shallow agree where the surface already is."""
 
     edge: float
     reach: float
@@ -226,7 +226,9 @@ def refine(
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
         far = changes["vertex_change_px"] > round_settings.reach
-        again = (far or changes["vertex_change_px"] > round_settings.still) and repeats < MOST_REPEATS
+        # Where the model does not fit, single photographs pull vertices elsewhere.
+        moving = changes["vertex_change_px"] > round_settings.still and changes.get("residual", np.inf) <= POOR_FIT
+        again = (far or moving) and repeats < MOST_REPEATS
         if again:
             pending.insert(0, round_settings)
             repeats += 1

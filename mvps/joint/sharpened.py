@@ -12,6 +12,9 @@ Edges come out round. With S the mean over what lies around, whose kernel has th
 
 gives back what blur took where normals next to each other differ by more, |n - S n|^2 / 2 = D^2 in the mean over some twenty of them, than
 their errors' variance e along a tangent makes them (Wiener 1949).
+
+Edges within a pixel take more than one pass. Then what lies beside an edge must not turn beyond it: the way from n to a sharper n' is
+taken as far as the farthest of the normals next to n lies along it (`within`; Osher and Rudin 1990).
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import scipy.sparse as sp
 
 from mvps.camera import footprint
 from mvps.mesh import normalise
@@ -64,3 +68,16 @@ def sharpened(
     part = np.nan_to_num(1 - error / np.maximum(apart, LEAST_TURN**2)).clip(0)
     gain = SHARPENING * part * blur / np.maximum(spread, np.finfo(float).tiny)
     return normalise(normal + gain.clip(max=MOST_GAIN)[:, None] * away)
+
+
+def within(normal: Float, sharper: Float, beside: sp.csr_matrix) -> Float:
+    """Normals (n, 3), unit, turned to sharper ones (n, 3), no farther along the way than the farthest of those next to them. beside (n, n):
+    not 0 for those next to each other, and for each itself."""
+    way = sharper - normal
+    own, along = np.repeat(np.arange(len(normal)), np.diff(beside.indptr)), np.zeros(beside.nnz)
+    # One coordinate at a time: pairs are many.
+    for k in range(3):
+        along += normal[beside.indices, k] * way[own, k]
+    farthest = np.maximum.reduceat(along, beside.indptr[:-1]) - (normal * way).sum(1)
+    share = np.clip(farthest / np.maximum((way**2).sum(1), np.finfo(float).tiny), 0, 1)
+    return normalise(normal + share[:, None] * way)
