@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from scipy.special import erf
 from sphere_scene import make_sphere
 from test_agreement import true_maps
 
 from mvps.joint.fused import NORMAL_SIGMA, SHARED_SIGMA, _without_blur, face_targets
 from mvps.joint.observe import visible_in
-from mvps.joint.sharpened import SHARPENING
+from mvps.joint.sharpened import SHARPENING, within
 from mvps.mesh import angles_deg, normalise
 from mvps.scene import Capture, Surface
 
@@ -96,6 +97,17 @@ def test_a_sharpened_ridge_does_not_overshoot() -> None:
     found = _without_blur(blurred, 2.0 * everywhere, 0 * everywhere, everywhere > 0, ridge)
     slope = np.abs(found[:, 0] / found[:, 2])[inner]
     assert slope.max() < 1.01 and np.median(slope) > 0.99
+
+
+def test_a_normal_turns_no_farther_than_those_beside_it() -> None:
+    """Three in a row at 0, 10 and 20 degrees: the middle one may turn to either end and not beyond, the ends only inwards."""
+    tilt = np.radians([0.0, 10.0, 20.0])
+    normal = np.stack([np.sin(tilt), 0 * tilt, np.cos(tilt)], 1)
+    beside = sp.csr_matrix(np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]]))
+    for wanted, got in (([-5, 15, 25], [0, 15, 20]), ([5, 40, 15], [5, 20, 15])):
+        towards = np.radians(wanted)
+        found = within(normal, np.stack([np.sin(towards), 0 * tilt, np.cos(towards)], 1), beside)
+        np.testing.assert_allclose(np.degrees(np.arctan2(found[:, 0], found[:, 2])), got, atol=0.3)
 
 
 def test_what_is_error_alone_is_not_sharpened() -> None:

@@ -51,7 +51,7 @@ def tells(capture: Capture) -> bool:
     return min(len(view.lights) for view in capture.views) >= 2 * MINIMUM_LIGHTS
 
 
-def parts(capture: Capture, model: Model) -> tuple[tuple[Capture, Lights], tuple[Capture, Lights]]:
+def split(capture: Capture, model: Model) -> tuple[tuple[Capture, Lights], tuple[Capture, Lights]]:
     """Photographs and lights by which vertices are solved, and those that are held out."""
     stride = max(2, round(min(len(view.lights) for view in capture.views) / ENOUGH_LIGHTS))
     return part(capture, model.lights, 0, stride), part(capture, model.lights, 1, stride)
@@ -63,7 +63,7 @@ def confirmed(capture: Capture, body: Object, motions: Float) -> bool:
     if not tells(capture):
         return True
     model = quick_model(capture, chosen_device("cpu"))
-    (fit, lights), (held, their_lights) = parts(capture, model)
+    (fit, lights), (held, their_lights) = split(capture, model)
     errors = []
     for by in (np.zeros_like(motions), motions):
         vertices = solved(with_motions(fit, body, by), lights, model)[1]
@@ -77,7 +77,7 @@ def by_photographs(capture: Capture, body: Object) -> tuple[Capture, list[float]
     factors = list[float]()
     for _ in range(TURNS if tells(capture) else 0):
         model = quick_model(capture, chosen_device("cpu"))
-        (fit, lights), (held, their_lights) = parts(capture, model)
+        (fit, lights), (held, their_lights) = split(capture, model)
         _, before = solved(fit, lights, model)
         motions, after = aligned(fit, lights, before, body)
         moved = with_motions(held, body, motions)

@@ -49,16 +49,12 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
     still = np.zeros((len(capture.views), UNKNOWNS))
     before = outlines.misses(still)
     seen = f"lines of sight along the outlines miss what the other views leave of the object by {misfit(before):.2f} px in the mean"
-    motions = by_silhouettes(outlines, still)
-    if motions is None:
+    mended, factors = followed(capture, outlines, still)
+    if mended is capture:
         if misfit(before) <= DOUBTFUL_PIXELS:
             return capture, []
         text = f"{seen}, and moving the cameras does not mend it: masks or calibration are wrong in another way; check both"
         return capture, [Finding("pose", "all views", text, False)]
-    followed = confirmed(capture, outlines.body, motions)
-    mended, factors = by_photographs(with_motions(capture, outlines.body, motions) if followed else capture, outlines.body)
-    if mended is capture:
-        return capture, []
     shift = displacement(capture, mended, outlines.body)
     text = f"{seen}; cameras were moved by {np.median(shift):.2f} px (median; at most {shift.max():.2f}), which leaves"
     text += f" {misfit(outlines_of(mended).misses(still)):.2f} px"
@@ -70,6 +66,16 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
         text = f"{words} ({np.median(shift):.1f} px): no photograph shows a motion or a scale of the whole world"
         findings.append(Finding("pose", "all views", text, False))
     return mended, findings
+
+
+def followed(capture: Capture, outlines: Outlines, still: Float) -> tuple[Capture, list[float]]:
+    """The capture with its cameras where silhouettes want them, unless photographs contradict, and then where photographs do; as it was
+    where neither moves them. And by which factors the errors of held-out lights fell in the photographs' turns."""
+    motions = by_silhouettes(outlines, still)
+    if motions is None:
+        return capture, []
+    start = with_motions(capture, outlines.body, motions) if confirmed(capture, outlines.body, motions) else capture
+    return by_photographs(start, outlines.body)
 
 
 def by_silhouettes(outlines: Outlines, still: Float) -> Float | None:
