@@ -46,9 +46,6 @@ LEAST_VIEWS = 1.5
 ROUNDS = 2
 """Of averaging variances with the faces around."""
 
-PASSES = 2
-"""Of sharpening. Chosen among 1, 2 and 3 (docs/findings/edges.md): a third takes errors for edges."""
-
 
 class FaceNormals(NamedTuple):
     """Of n faces: normal (n, 3), unit, and the standard deviation sigma (n,) of either tangential component, radians."""
@@ -120,9 +117,9 @@ def _without_blur(normal: Float, blur: Float, error: Float, known: Bool, surface
     corners = np.repeat(np.arange(len(normal)), 3), surface.faces.ravel()
     held = sp.csr_matrix((np.ones(3 * len(normal), np.float32), corners), (len(normal), len(surface.vertices)))
     beside = held @ held.T
-    for _ in range(PASSES):
-        normal = within(normal, sharpened(normal, centre, blur, error, around, over_some), beside)
-    return normal
+    once = sharpened(normal, centre, blur, error, around, over_some)
+    # What turns by no more than lights may be off is no edge.
+    return within(once, sharpened(once, centre, blur, error + SHARED_SIGMA**2, around, over_some), beside)
 
 
 def _mean_around(values: Float, surface: Surface) -> Float:

@@ -13,8 +13,8 @@ Edges come out round. With S the mean over what lies around, whose kernel has th
 gives back what blur took where normals next to each other differ by more, |n - S n|^2 / 2 = D^2 in the mean over some twenty of them, than
 their errors' variance e along a tangent makes them (Wiener 1949).
 
-Edges within a pixel take more than one pass. Then what lies beside an edge must not turn beyond it: the way from n to a sharper n' is
-taken as far as the farthest of the normals next to n lies along it (`within`; Osher and Rudin 1990).
+Edges within a pixel take a second pass. In it what lies beside an edge must not turn beyond it: the way from n to a sharper n' is taken
+as far as the farthest of the normals next to n lies along it (`within`; Osher and Rudin 1990).
 """
 
 from __future__ import annotations
