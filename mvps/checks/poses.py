@@ -2,8 +2,8 @@
 
 Found where one step of all cameras that half of the outline points asks for lowers the misses of the other half by more than CERTAIN
 standard errors, both ways taken together (outlines.py). Then cameras move by one half of the points until it misses least, which has to
-lower the other half's misses again; from there by all points, if photographs are then predicted better; and last by the photographs
-(photographed.py).
+lower the other half's misses again; from there by all points, if misses are more than masks' rounding makes or photographs are then
+predicted better; and last by the photographs (photographed.py).
 
 The mean pose stays: a motion of the whole world shows in no photograph. A principal point that is off in all views is a shift of the
 object in every camera's frame; the part of it that is no motion of the world is undone by the cameras.
@@ -69,13 +69,14 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
 
 
 def followed(capture: Capture, outlines: Outlines, still: Float) -> tuple[Capture, list[float]]:
-    """The capture with its cameras where silhouettes want them, unless photographs contradict, and then where photographs do; as it was
-    where neither moves them. And by which factors the errors of held-out lights fell in the photographs' turns."""
+    """The capture with its cameras where silhouettes want them, unless masks' rounding might be why and photographs contradict, and then
+    where photographs do; as it was where neither moves them. And by which factors the errors of held-out lights fell in the photographs'
+    turns."""
     motions = by_silhouettes(outlines, still)
     if motions is None:
         return capture, []
-    start = with_motions(capture, outlines.body, motions) if confirmed(capture, outlines.body, motions) else capture
-    return by_photographs(start, outlines.body)
+    certain = misfit(outlines.misses(still)) > DOUBTFUL_PIXELS or confirmed(capture, outlines.body, motions)
+    return by_photographs(with_motions(capture, outlines.body, motions) if certain else capture, outlines.body)
 
 
 def by_silhouettes(outlines: Outlines, still: Float) -> Float | None:
