@@ -49,9 +49,10 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
     still = np.zeros((len(capture.views), UNKNOWNS))
     before = outlines.misses(still)
     seen = f"lines of sight along the outlines miss what the other views leave of the object by {misfit(before):.2f} px in the mean"
-    mended, factors = followed(capture, outlines, still)
+    rounding = misfit(before) <= DOUBTFUL_PIXELS
+    mended, factors = followed(capture, outlines, still, rounding)
     if mended is capture:
-        if misfit(before) <= DOUBTFUL_PIXELS:
+        if rounding:
             return capture, []
         text = f"{seen}, and moving the cameras does not mend it: masks or calibration are wrong in another way; check both"
         return capture, [Finding("pose", "all views", text, False)]
@@ -59,7 +60,7 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
     text = f"{seen}; cameras were moved by {np.median(shift):.2f} px (median; at most {shift.max():.2f}), which leaves"
     text += f" {misfit(outlines_of(mended).misses(still)):.2f} px"
     if factors:
-        text += f" and lowers the error of held-out lights by {100 * (1 - np.prod(factors)):.0f} % beyond what silhouettes do"
+        text += f"; what photographs moved of it lowers the error of held-out lights by {100 * (1 - np.prod(factors)):.0f} %"
     findings = [Finding("pose", "all views", text, True)]
     if ALONG_NORMALS * np.median(shift) > FRAME_PIXELS:
         words = "where the object lies and how large it is are known no better than the cameras were"
@@ -68,15 +69,15 @@ def poses(capture: Capture) -> tuple[Capture, list[Finding]]:
     return mended, findings
 
 
-def followed(capture: Capture, outlines: Outlines, still: Float) -> tuple[Capture, list[float]]:
-    """The capture with its cameras where silhouettes want them, unless masks' rounding might be why and photographs contradict, and then
-    where photographs do; as it was where neither moves them. And by which factors the errors of held-out lights fell in the photographs'
-    turns."""
+def followed(capture: Capture, outlines: Outlines, still: Float, rounding: bool) -> tuple[Capture, list[float]]:
+    """The capture with its cameras where silhouettes want them, unless masks' rounding might be why (`rounding`) and photographs
+    contradict, and then where photographs do; as it was where neither moves them. And by which factors the errors of held-out lights fell
+    in the photographs' turns."""
     motions = by_silhouettes(outlines, still)
     if motions is None:
         return capture, []
-    certain = misfit(outlines.misses(still)) > DOUBTFUL_PIXELS or confirmed(capture, outlines.body, motions)
-    return by_photographs(with_motions(capture, outlines.body, motions) if certain else capture, outlines.body)
+    believed = not rounding or confirmed(capture, outlines.body, motions)
+    return by_photographs(with_motions(capture, outlines.body, motions) if believed else capture, outlines.body)
 
 
 def by_silhouettes(outlines: Outlines, still: Float) -> Float | None:
