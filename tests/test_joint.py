@@ -25,8 +25,9 @@ from mvps.joint.observe import SHADOW_MARGIN, ViewSamples, observe
 from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import _beside, all_pixel_normals, filled
 from mvps.joint.reflectance import Observed
+from mvps.joint.shown import OWN_SHARE
 from mvps.joint.state import State
-from mvps.joint.stated import stated_errors
+from mvps.joint.stated import scatter, stated_errors
 from mvps.joint.steps import LEAST_NOISE, SCALE_FLOOR, _least_scale, free_reflectance, vertex_step, with_population
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import fuse
@@ -293,7 +294,8 @@ def test_steps_of_rank_deficient_problems_are_finite(scene: SphereScene, case: s
         state = vertex_step(few, state, lights[:1], law, anchor)
         assert all(torch.isfinite(t).all() for t in (state.normal, state.reflectance, state.scale)) and (state.reflectance >= 0).all()
         assert torch.allclose(state.normal.norm(dim=1), torch.tensor(1.0), atol=1e-5)
-    certain = stated_errors(Observed(scene.capture, scene.reconstruction.surface, few, state, lights[:1], law), 0.3).confidence
+    told = scatter(Observed(scene.capture, scene.reconstruction.surface, few, state, lights[:1], law), 0.01)
+    certain = stated_errors(told, state.normal.double().numpy(), scene.reconstruction.surface, OWN_SHARE, 0.3)
     assert (certain >= 0).all() and (certain <= 1).all()
     few, state, anchor, patches = in_patches(scene.reconstruction.surface, few, state, anchor)
     state = vertex_step(few, state, lights[:1], law, anchor, patches=patches)

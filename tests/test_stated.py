@@ -14,10 +14,11 @@ from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
 from mvps.joint.grey import grey_lights
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.reflectance import Observed
-from mvps.joint.stated import icosahedron, stated_errors
+from mvps.joint.shown import OWN_SHARE
+from mvps.joint.stated import icosahedron, scatter, stated_errors
 from mvps.joint.steps import free_reflectance, vertex_steps
 from mvps.mesh import vertex_normals
-from mvps.scene import RELIABLE, Float, Law, Surface
+from mvps.scene import RELIABLE, Float, Law
 
 CPU = torch.device("cpu")
 LAMBERT = Law(())
@@ -41,12 +42,13 @@ def photographed(scene: SphereScene) -> tuple[list[ViewSamples], Vertices, list[
 
 
 def stated_deg(
-    scene: SphereScene, views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], finer: bool = False
+    scene: SphereScene, views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], noise: float = 0.0
 ) -> Float:
-    """Stated standard deviations, degrees, infinite where nothing is known."""
-    observed = Observed(scene.capture, scene.reconstruction.surface, views, vertices, lights, LAMBERT)
+    """Stated standard deviations, degrees, infinite where nothing is known; noise: a share of the signal that is the photographs' own."""
+    surface, normal = scene.reconstruction.surface, vertices.normal.double().numpy()
+    told = scatter(Observed(scene.capture, surface, views, vertices, lights, LAMBERT), noise)
     with np.errstate(divide="ignore"):
-        return np.degrees(RELIABLE * np.sqrt(1 / stated_errors(observed, 0.3, finer).confidence - 1))
+        return np.degrees(RELIABLE * np.sqrt(1 / stated_errors(told, normal, surface, OWN_SHARE, 0.3) - 1))
 
 
 def solved(views: list[ViewSamples], truth: Vertices, lights: list[DirectionalLights]) -> Vertices:
@@ -68,11 +70,11 @@ def of_view(samples: ViewSamples, draw: torch.Generator) -> torch.Tensor:
     return 0.05 * slope * torch.randn(len(samples.vertex), 1, generator=draw)
 
 
-@pytest.mark.parametrize(("error", "most"), [(independent, 2.5), (of_view, 3.0)])
-def test_stated_errors_are_no_smaller_than_those_that_come_out(scene: SphereScene, error: Callable[..., torch.Tensor], most: float) -> None:
-    """They err on the safe side. Where samples share nothing, the sums over views and lights and what the surface contradicts each say the
-    whole error: 1.7 times as large (1.4 to 2.0 in quarters). Slopes of views partly cancel in a view but not under a light, which then says
-    still more."""
+@pytest.mark.parametrize("error", [independent, of_view])
+def test_stated_errors_are_those_that_come_out(scene: SphereScene, error: Callable[..., torch.Tensor]) -> None:
+    """On a surface without errors: of the vertices' own normals, which contradict it by as much. Where samples share nothing, or slopes
+    that partly cancel in a view but not under a light, the samples' scatter comes on top: 1.5 and 1.3 times as large (1.1 to 1.9 and 1.0
+    to 1.7 in quarters)."""
     views, truth, lights = photographed(scene)
     draw = torch.Generator().manual_seed(0)
     wrong = [replace(samples, image=samples.image + error(samples, draw)) for samples in views]
@@ -80,7 +82,7 @@ def test_stated_errors_are_no_smaller_than_those_that_come_out(scene: SphereScen
     stated, measured = stated_deg(scene, wrong, found, lights), measured_deg(found, truth)
     known = np.flatnonzero(np.isfinite(stated))
     for group in np.array_split(known[np.argsort(stated[known])], 4):
-        assert 1 < np.sqrt((stated[group] ** 2).mean() / (measured[group] ** 2).mean()) < most
+        assert 0.9 < np.sqrt((stated[group] ** 2).mean() / (measured[group] ** 2).mean()) < 2
 
 
 def test_what_the_surface_contradicts_is_stated(scene: SphereScene) -> None:
@@ -114,25 +116,39 @@ def test_kinds_of_lights_are_spread_evenly() -> None:
     assert np.allclose(nearest[:, -6:-1], 1 / np.sqrt(5)) and np.allclose(corners.sum(0), 0)
 
 
-def test_detail_at_the_edges_stands_for_detail_below_them(scene: SphereScene) -> None:
-    """Normals that change from each vertex to the next, of the photographs and of the surface alike, state about as much error; what noise
-    makes them differ by is not taken for detail."""
-    _, truth, lights = photographed(scene)
-    ball, draw = scene.reconstruction.surface, torch.Generator().manual_seed(0)
-    edge = np.linalg.norm(ball.vertices[ball.faces[:, 0]] - ball.vertices[ball.faces[:, 1]], axis=1).mean()
-    lumps = np.random.default_rng(0).normal(size=(len(ball.vertices), 1)) * 0.04 * edge
-    rough = Surface(ball.vertices * (1 + lumps / np.linalg.norm(ball.vertices, axis=1, keepdims=True)), ball.faces)
-    turned = replace(truth, normal=torch.tensor(vertex_normals(rough), dtype=torch.float32))
-    stated = []
-    for surface, vertices in ((ball, truth), (rough, turned)):
-        made = SphereScene(replace(scene.reconstruction, surface=surface), scene.capture)
-        views = photographed(made)[0]
-        noisy = [replace(samples, image=samples.image + 0.01 * independent(samples, draw)) for samples in views]
-        found = stated_deg(made, noisy, vertices, lights)
-        stated.append(np.sqrt((found[np.isfinite(found)] ** 2).mean()))
-    shown = np.degrees((turned.normal - truth.normal).norm(dim=1).numpy()) / np.sqrt(2)
-    assert 0.5 < stated[1] / np.sqrt((shown**2).mean()) < 2
-    assert stated[0] < 0.3 * stated[1]
-    # A finer mesh has it.
-    within = stated_deg(made, noisy, vertices, lights, finer=True)
-    assert np.sqrt((within[np.isfinite(within)] ** 2).mean()) < 0.3 * stated[1]
+def test_noise_of_photographs_counts_by_the_normals_share(scene: SphereScene) -> None:
+    """What is left is how far the vertices' normals are from the surface's, which noise does as well."""
+    views, truth, lights = photographed(scene)
+    draw = torch.Generator().manual_seed(0)
+    noisy = [replace(samples, image=samples.image + independent(samples, draw)) for samples in views]
+    found = solved(noisy, truth, lights)
+    level = np.sqrt(np.mean([samples.image.square().mean() for samples in views]))
+    misfit, noise = (stated_deg(scene, noisy, found, lights, share) for share in (0.0, 0.02 / level))
+    known = np.isfinite(misfit)
+    rms = [np.sqrt((values[known] ** 2).mean()) for values in (misfit, noise, measured_deg(found, truth))]
+    assert 1.25 * rms[1] < rms[0] and rms[1] < 1.25 * rms[2]
+
+
+def test_vertices_whose_samples_say_little_are_known_from_those_beside_them(scene: SphereScene) -> None:
+    """Among neighbours that are known to a degree, some that samples say nearly nothing of are not as far off as the tie would have it."""
+    views, truth, lights = photographed(scene)
+    draw = torch.Generator().manual_seed(0)
+    few = torch.rand(len(truth.normal), generator=draw) < 0.1
+    noisy = [
+        replace(s, image=s.image + independent(s, draw), data=s.data & ~(few[s.vertex, None] & (torch.arange(s.image.shape[1]) > 0)))
+        for s in views
+    ]
+    found = solved(noisy, truth, lights)
+    turned = replace(found, normal=torch.where(few[:, None], truth.normal, found.normal))
+    stated = stated_deg(scene, noisy, turned, lights)
+    known = np.isfinite(stated)
+    assert stated[known & few.numpy()].max() < 3 * np.median(stated[known & ~few.numpy()])
+
+
+def test_where_no_samples_tell_the_tie_stands_in(scene: SphereScene) -> None:
+    """Normals that are the surface's throughout, because each view has one light, are no better known than they are tied to it."""
+    views, truth, lights = photographed(scene)
+    draw = torch.Generator().manual_seed(0)
+    single = [replace(s, image=s.image + independent(s, draw), data=s.data & (torch.arange(s.image.shape[1]) == 0)) for s in views[:1]]
+    stated = stated_deg(scene, single, truth, lights[:1])
+    assert np.median(stated[np.isfinite(stated)]) > np.degrees(0.1)

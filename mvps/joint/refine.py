@@ -30,15 +30,15 @@ from mvps.joint.photoconsistency import photoconsistency, shown_in
 from mvps.joint.photometry import WEAK_TIE, Task, photometric_round
 from mvps.joint.pixels import few_lights
 from mvps.joint.reflectance import Observed
-from mvps.joint.shown import own_normals, shaded_as
+from mvps.joint.shown import OWN_SHARE, own_normals, shaded_as
 from mvps.joint.state import State, grey_albedo, material_of, relative_residuals
-from mvps.joint.stated import stated_errors
+from mvps.joint.stated import scatter, stated_errors
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
 from mvps.memory import room_for, solved_together
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
-from mvps.noise import dark_noise_share
+from mvps.noise import dark_noise_share, samples_noise
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 from mvps.silhouette import mask_distances
 
@@ -261,9 +261,10 @@ def _coloured(state: State, settings: RefineSettings, generator: np.random.Gener
     if settings.model.neural:
         trial, residual = neural_residual(observed, relative_residuals(observed.views, observed.vertices), POOR_FIT, generator)
         state.trials.append(trial)
-    stated, material = stated_errors(observed, WEAK_TIE, settings.detail), material_of(state, albedo)
-    certain = np.where(np.isfinite(albedo).all(1), stated.confidence, 0)
-    material = replace(material, normal=own_normals(material.normal, stated.noise, observed), confidence=certain, residual=residual)
+    material, told = material_of(state, albedo), scatter(observed, samples_noise(observed.capture))
+    normal = own_normals(material.normal, told.noise, observed)
+    certain = np.where(np.isfinite(albedo).all(1), stated_errors(told, normal, state.surface, OWN_SHARE, WEAK_TIE), 0)
+    material = replace(material, normal=normal, confidence=certain, residual=residual)
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 
 

@@ -13,17 +13,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from mvps.camera import view_directions
 from mvps.joint.reflectance import Observed
 from mvps.joint.sharpened import PIXEL_BLUR, pixel_area, sharpened
-from mvps.joint.stated import averaged
-from mvps.mesh import edges, neighbour_sums, normalise, vertex_normals
+from mvps.mesh import averaged, edges, neighbour_sums, normalise, vertex_normals
 from mvps.scene import Float, Material, Surface
 
 SURFACE_SHARE = 2.0
 """Of the surface's normal over the vertex's own: on seven results 3 was as good, on eighteen 1 was worse (docs/findings/edges.md)."""
+
+OWN_SHARE = 1 / (1 + SURFACE_SHARE)
+"""Of a vertex's own normal in what is shaded."""
 
 
 def own_normals(normal: Float, noise: Float, of: Observed) -> Float:
@@ -41,8 +42,7 @@ def own_normals(normal: Float, noise: Float, of: Observed) -> Float:
     count, known = np.maximum(np.bincount(ends.ravel(), minlength=len(normal)), 1), np.isfinite(noise)
 
     def over_some(values: Float) -> Float:
-        of_known = torch.from_numpy(np.where(known, values, 0)[:, None])
-        return averaged(of_known, torch.from_numpy(known), torch.from_numpy(ends))[:, 0].numpy()
+        return averaged(np.where(known, values, 0)[:, None], known, ends)[:, 0]
 
     # A mean over neighbours has noise of its own.
     error = over_some(noise * (1 + 1 / count))
