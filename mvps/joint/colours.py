@@ -1,42 +1,59 @@
-"""Colours of the body and of the lobes, once lights with their colours and the grey image model are known.
+"""Colours of the body, of the lobes and of the lights, once the grey image model is known.
 
-With the lights' colours taken out, y_c = radiance_c / r_c, a vertex with albedo a (RGB) and grey weights w_k shows
+With a light's colour r taken out, its channels' intensities over their mean, y_c = radiance_c / r_c, a vertex with albedo a (RGB) and grey
+weights w_k shows
 
-    y_c = a_c q + t_c S,     q = dI/da,   S = sum_k w_k q_k   (blocks.py)
+    y_c = a_c q_c + t_c S,     q_c = dI/da + e b (G_c - G),     S = sum_k w_k q_k   (blocks.py)
 
-where t is the lobes' colour, one for the object: white on dielectrics, the body's on metals. Every vertex's albedo is eliminated (variable
-projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance,
+where t is the lobes' colour, one for the object: white on dielectrics, the body's on metals. Once albedos are known, what diffuse surfaces
+send has their colour, b G_c (bounce.py); where lobes take part in it (gleam.py) it counts as grey. Every vertex's albedo is eliminated
+(variable projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance,
 
-    a_c = (<q y_c> - t_c <q S>) / <q q>,   at least 0
-    t_c = sum_v (<S y_c> - a0_c <q S>) / sum_v (<S S> - <q S>^2 / <q q>),   a0 = <q y_c> / <q q>;  where a is at its bound, without a0
+    a_c = (<q_c y_c> - t_c <q_c S>) / <q_c q_c>,   at least 0
+    t_c = sum_v (<S y_c> - a0_c <q_c S>) / sum_v (<S S> - <q_c S>^2 / <q_c q_c>),   a0 = <q y> / <q q>;  where a is at its bound, without a0
 
-Lobes stay white unless a colour predicts held-out lights better (material.py).
+Lobes stay white unless a colour predicts held-out lights better (material.py). Lights' colours are solved in turn with these two, as ratios
+of robust sums over what is predicted,
+
+    r_lc = sum w radiance_c (a_c q + t_c S) / sum w (a_c q + t_c S)^2,     w = (diffuse part / all)^2   on top of the robust weights
+
+because lobes may have other colours still. One factor per channel is free: r has mean one over the lights.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from mvps.bounce import interpolation
 from mvps.cores import on_cores
-from mvps.joint.reflectance import Observed, chunks
+from mvps.gleam import Senders, terms
+from mvps.joint.reflectance import Chunk, Observed, chunks
 from mvps.joint.trial import parted
 from mvps.material import Trial, judged
+from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Float
 
 BOUND_SWEEPS = 4
-"""Of the two formulas above in turn: which vertices have no body settles in two or three."""
+"""Of the formulas for a and t in turn: which vertices have no body settles in two or three."""
+
+LIGHT_SWEEPS = 3
+"""Of lights' colours in turn with the others; every round goes on from those of the last."""
 
 WHITE = (1.0, 1.0, 1.0)
 
+Single = NDArray[np.float32]
+
 
 class _Sums(NamedTuple):
-    """Per vertex: <q q>, <q S>, <S S> (V,); <q y>, <S y>, <y y> (V, 3)."""
+    """Per vertex <q q>, <q S>, <S S>, <q y>, <S y>, <y y>, (V, 3) each."""
 
     qq: Float
     qS: Float
@@ -46,23 +63,27 @@ class _Sums(NamedTuple):
     yy: Float
 
 
-def _sums(of: Observed, ratios: Sequence[Float]) -> _Sums:
+def _sums(of: Observed, ratios: Sequence[Float], samples_of: Callable[[int], Iterable[Chunk]], sent: Senders | None = None) -> _Sums:
+    """samples_of: those of a view by its number; sent: as in `colours`."""
+    scale, beyond_grey = of.vertices.scale.cpu().numpy(), None if sent is None else _beyond_grey(of, sent)
+
     def of_view(i: int) -> _Sums:
-        n = len(of.views[i].vertex)
-        out = _Sums(*(np.zeros(n) for _ in range(3)), *(np.zeros((n, 3)) for _ in range(3)))
-        scale = of.vertices.scale.cpu().numpy()
-        ratio = ratios[i].astype(np.float32)
-        for chunk in chunks(of, i):
-            w, q, S = chunk.weight / scale[chunk.rows, None] ** 2, chunk.basis, chunk.predicted - chunk.diffuse
-            white = chunk.image / ratio
-            out.qq[chunk.part], out.qS[chunk.part], out.SS[chunk.part] = (np.einsum("pl,pl->p", w, a) for a in (q * q, q * S, S * S))
-            out.qy[chunk.part] = np.einsum("pl,plc->pc", w * q, white)
-            out.Sy[chunk.part] = np.einsum("pl,plc->pc", w * S, white)
-            out.yy[chunk.part] = np.einsum("pl,plc->pc", w, white**2)
+        out = _Sums(*(np.zeros((len(of.views[i].vertex), 3)) for _ in _Sums._fields))
+        ratio, more = ratios[i].astype(np.float32), None if beyond_grey is None else beyond_grey(i)
+        for chunk in samples_of(i):
+            w, q, S, y = chunk.weight / scale[chunk.rows, None] ** 2, chunk.basis, chunk.predicted - chunk.diffuse, chunk.image / ratio
+            if more is None:
+                of_body = (w * q * q).sum(1, keepdims=True), (w * q * S).sum(1, keepdims=True), _over_lights(w * q, y)
+            else:
+                q_c = q[..., None] + more(chunk.part)
+                of_body = _over_lights(w, q_c * q_c), _over_lights(w * S, q_c), _over_lights(w, q_c * y)
+            qq, qS, qy = of_body
+            sums = qq, qS, (w * S * S).sum(1, keepdims=True), qy, _over_lights(w * S, y), _over_lights(w, y * y)
+            for total, of_chunk in zip(out, sums, strict=True):
+                total[chunk.part] = of_chunk
         return out
 
-    n = len(of.vertices.normal)
-    total = _Sums(*(np.zeros(n) for _ in range(3)), *(np.zeros((n, 3)) for _ in range(3)))
+    total = _Sums(*(np.zeros((len(of.vertices.normal), 3)) for _ in _Sums._fields))
     for samples, part in zip(of.views, on_cores(of_view, range(len(of.views))), strict=True):
         index = samples.vertex.cpu().numpy()
         for whole, some in zip(total, part, strict=True):
@@ -70,31 +91,49 @@ def _sums(of: Observed, ratios: Sequence[Float]) -> _Sums:
     return total
 
 
+def _over_lights(weight: Single, values: Single) -> Single:
+    """(n, 3) sums of values (n, lights, 3) with weights (n, lights)."""
+    return (weight[:, None] @ values)[:, 0]
+
+
+def _beyond_grey(of: Observed, sent: Senders) -> Callable[[int], Callable[[slice], Single]]:
+    """e b (G_c - G) (n, lights, 3) of some pairs of a view by its number."""
+    weights = interpolation(sent.sources.of, of.surface.vertices, vertex_normals(of.surface))
+
+    def of_view(i: int) -> Callable[[slice], Single]:
+        samples, lights = of.views[i], of.lights[i]
+        assert samples.gathered is not None
+        G = terms(sent, lights.direction.double().cpu().numpy(), of.capture.views[i].camera.centre)[:, :, 0]
+        rows, grey = weights[samples.vertex.cpu().numpy()], samples.gathered[..., :1].cpu().numpy()
+        strength = np.float32(of.law.bounce) * lights.intensity.cpu().numpy()[:, None]
+        return lambda part: strength * ((rows[part] @ G.reshape(len(G), -1)).reshape(-1, *G.shape[1:]) - grey[part])
+
+    return of_view
+
+
 def _albedo(sums: _Sums, tint: Float) -> Float:
     """(V, 3), 0 for a vertex without samples."""
-    return np.maximum((sums.qy - tint * sums.qS[:, None]) / np.maximum(sums.qq, np.finfo(float).tiny)[:, None], 0)
+    return np.maximum((sums.qy - tint * sums.qS) / np.maximum(sums.qq, np.finfo(float).tiny), 0)
 
 
 def _tint(sums: _Sums) -> Float:
     """(3,) colour of the lobes; white where there are none."""
-    seen = sums.qq > 0
-    qq, qS, SS = (values[seen, None] for values in (sums.qq, sums.qS, sums.SS))
-    qy, Sy = sums.qy[seen], sums.Sy[seen]
+    seen = (sums.qq > 0).all(1)
+    qq, qS, SS, qy, Sy = (values[seen] for values in (sums.qq, sums.qS, sums.SS, sums.qy, sums.Sy))
     tint = np.ones(3)
     for _ in range(BOUND_SWEEPS):
         body: Bool = qy - tint * qS > 0
         top = (Sy - np.where(body, qy * qS / qq, 0)).sum(0)
         bottom = np.where(body, SS - qS**2 / qq, SS).sum(0)
         # Lobes that shine like the body cannot be told from it.
-        known = bottom > 1e-6 * SS.sum()
+        known = bottom > 1e-6 * SS.sum(0)
         tint = np.where(known, np.maximum(top, 0) / np.where(known, bottom, 1), 1.0)
     return tint
 
 
 def _errors(kept: _Sums, albedo: Float, tint: Float) -> Float:
     """(V,) root mean square error of samples over their root mean square; NaN without any."""
-    qq, qS, SS = (values[:, None] for values in (kept.qq, kept.qS, kept.SS))
-    square = kept.yy - 2 * albedo * kept.qy - 2 * tint * kept.Sy + albedo**2 * qq + 2 * albedo * tint * qS + tint**2 * SS
+    square = kept.yy - 2 * albedo * kept.qy - 2 * tint * kept.Sy + albedo**2 * kept.qq + 2 * albedo * tint * kept.qS + tint**2 * kept.SS
     level = kept.yy.sum(1)
     return np.where(level > 0, np.sqrt(np.maximum(square.sum(1), 0) / np.where(level > 0, level, 1)), np.nan)
 
@@ -105,14 +144,57 @@ def lobes_in_colour(of: Observed, ratios: Sequence[Float], some: torch.Tensor) -
     chosen = torch.zeros(len(of.vertices.normal), dtype=torch.bool, device=some.device)
     chosen[some] = True
     few = [samples.of_pairs(chosen[samples.vertex].nonzero()[:, 0]) for samples in of.views]
-    fitted, kept = (_sums(of._replace(views=views), ratios) for views in parted(few))
+    parts = (of._replace(views=views) for views in parted(few))
+    fitted, kept = (_sums(part, ratios, partial(chunks, part)) for part in parts)
     white, tint = np.array(WHITE), _tint(fitted)
     before, after = (_errors(kept, _albedo(fitted, t), t) for t in (white, tint))
     return replace(judged("lobes in a colour of their own", before, after), seconds=time.perf_counter() - start)
 
 
-def colours(of: Observed, ratios: Sequence[Float], coloured_lobes: bool) -> tuple[Float, Float]:
-    """Albedo (V, 3), NaN where no view sees the vertex, and the lobes' colour (3,), under lights of known channel ratios (lights, 3)."""
-    sums = _sums(of, ratios)
+def colours(of: Observed, ratios: Sequence[Float], coloured_lobes: bool, sent: Senders | None = None) -> tuple[Float, Float]:
+    """Albedo (V, 3), NaN where no view sees the vertex, and the lobes' colour (3,), under lights of known channel ratios (lights, 3).
+
+    sent: what diffuse surfaces send light on by, in colour; None: what arrives counts as grey.
+    """
+    sums = _sums(of, ratios, partial(chunks, of), sent)
     tint = _tint(sums) if coloured_lobes else np.array(WHITE)
-    return np.where(sums.qq[:, None] > 0, _albedo(sums, tint), np.nan), tint
+    return np.where(sums.qq > 0, _albedo(sums, tint), np.nan), tint
+
+
+def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:
+    """Per view the lights' channel ratios (lights, 3), from `ratios` on. All samples are kept meanwhile: those of some thousand vertices
+    are enough."""
+    kept = on_cores(lambda i: list(chunks(of, i)), range(len(of.views)))
+    for _ in range(LIGHT_SWEEPS):
+        sums = _sums(of, ratios, kept.__getitem__)
+        tint = _tint(sums)
+        albedo = _albedo(sums, tint)
+        of_lights = on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tint), range(len(kept)))  # noqa: B023
+        ratios = _ratios(of_lights, one_rig)
+    return ratios
+
+
+def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float) -> tuple[Float, Float]:
+    """Numerators and denominators of r (count, 3) of a view's samples, for albedo (V, 3) and the lobes' colour (3,)."""
+    top, bottom = np.zeros((2, count, 3))
+    body, lobes = albedo.astype(np.float32), tint.astype(np.float32)
+    for chunk in of_view:
+        weight = chunk.weight * (chunk.diffuse / np.maximum(chunk.predicted, 1e-12)) ** 2
+        shown = chunk.basis[..., None] * body[chunk.rows, None] + (chunk.predicted - chunk.diffuse)[..., None] * lobes
+        weighted = weight[..., None] * shown
+        top += np.einsum("plc,plc->lc", weighted, chunk.image)
+        bottom += np.einsum("plc,plc->lc", weighted, shown)
+    return top, bottom
+
+
+def _ratios(sums: list[tuple[Float, Float]], one_rig: bool) -> list[Float]:
+    if one_rig:
+        sums = [(np.sum([t for t, _ in sums], axis=0), np.sum([b for _, b in sums], axis=0))] * len(sums)
+    ratios = [top / np.maximum(bottom, 1e-300) for top, bottom in sums]
+    # Of a photograph that was left out no sample speaks: white.
+    ratios = [np.where(ratio.sum(1, keepdims=True) > 0, ratio, 1.0) for ratio in ratios]
+    ratios = [ratio / np.maximum(ratio.mean(1, keepdims=True), 1e-300) for ratio in ratios]
+    # A common tint of all lights is a tint of the object: the convention is lights that are white on average.
+    tint = np.mean(np.concatenate(ratios), axis=0)
+    ratios = [ratio / tint for ratio in ratios]
+    return [ratio / ratio.mean(1, keepdims=True) for ratio in ratios]

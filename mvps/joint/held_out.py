@@ -11,9 +11,10 @@ import torch
 
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
+from mvps.joint.colours import light_ratios
 from mvps.joint.lighting import LIGHT_VERTICES, drawn
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
-from mvps.joint.reflectance import Observed, light_ratios
+from mvps.joint.reflectance import Observed
 from mvps.scene import Capture, Float, Law, Lights, Material, Surface
 
 STEPS = 6

@@ -9,11 +9,12 @@ import torch
 
 from mvps.camera import surface_pixel
 from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.colours import light_ratios
 from mvps.joint.grey import coloured_lights, grey_lights, tensor32
 from mvps.joint.lights import OfLaw, light_step, subset, told_by_shadows, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio
 from mvps.joint.patches import Patches
-from mvps.joint.reflectance import Observed, light_ratios
+from mvps.joint.reflectance import Observed
 from mvps.joint.state import State
 from mvps.joint.steps import Anchor, vertex_step
 from mvps.mesh import angles_deg, edges, lengths

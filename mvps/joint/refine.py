@@ -31,7 +31,7 @@ from mvps.joint.photometry import WEAK_TIE, Task, photometric_round
 from mvps.joint.pixels import few_lights
 from mvps.joint.reflectance import Observed
 from mvps.joint.shown import OWN_SHARE, own_normals, shaded_as
-from mvps.joint.state import State, grey_albedo, material_of, relative_residuals
+from mvps.joint.state import State, grey_albedo, material_of, relative_residuals, senders_in_colour
 from mvps.joint.stated import scatter, stated_errors
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
@@ -257,6 +257,10 @@ def _coloured(state: State, settings: RefineSettings, generator: np.random.Gener
         state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
         coloured_lobes = state.trials[-1].kept
     albedo, tint = colours(observed, ratios, coloured_lobes)
+    # What arrives from coloured surfaces has a colour, with which their albedo would be too strong.
+    sent = senders_in_colour(state, albedo)
+    if sent is not None:
+        albedo, tint = colours(observed, ratios, coloured_lobes, sent)
     residual = None
     if settings.model.neural:
         trial, residual = neural_residual(observed, relative_residuals(observed.views, observed.vertices), POOR_FIT, generator)

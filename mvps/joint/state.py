@@ -52,6 +52,14 @@ def senders_of(state: State, vertices: Vertices) -> Senders | None:
     return senders(state.gathers[state.lobed], state.surface, state.law, albedo, weight if state.lobed else None)
 
 
+def senders_in_colour(state: State, albedo: Float) -> Senders | None:
+    """What diffuse surfaces send light on by, in the colours of albedo (V, 3), NaN where no view sees; None where inter-reflection is not
+    modelled, and where lobes take part in it."""
+    if not state.law.bounce or state.lobed or False not in state.gathers:
+        return None
+    return senders(state.gathers[False], state.surface, state.law, material_of(state, albedo).albedo, None)
+
+
 def lit_by(state: State, views: list[ViewSamples], of: Capture, lights: Lights, sent: Senders | None) -> list[ViewSamples]:
     """The samples with what other surfaces send to them."""
     return views if sent is None else with_gathered(views, of, state.surface, sent, lights)
