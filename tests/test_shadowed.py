@@ -48,13 +48,14 @@ def camera_above(tilt: float, turn: float) -> Camera:
 
 
 class Seen:
-    """Four views of the bowl under six lights, and its samples with what its walls send under the true strength."""
+    """Four views of the bowl under six lights, and its samples with what its walls send under the true strength, in grey; albedo: of its
+    channels, ALBEDO in the mean."""
 
-    def __init__(self) -> None:
+    def __init__(self, albedo: tuple[float, float, float] = (ALBEDO, ALBEDO, ALBEDO)) -> None:
         surface = bowl()
         count = len(surface.vertices)
         material = Material(
-            vertex_normals(surface), np.full((count, 3), ALBEDO), np.zeros((count, 0)), np.zeros(0), np.ones(count), bounce=BOUNCE
+            vertex_normals(surface), np.tile(albedo, (count, 1)), np.zeros((count, 0)), np.zeros(0), np.ones(count), bounce=BOUNCE
         )
         caster, sent = ray_caster(surface), coarse_senders(surface, material, grey=True)
         turn = np.arange(6) * np.pi / 3
