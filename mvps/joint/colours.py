@@ -165,12 +165,15 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
     """Per view the lights' channel ratios (lights, 3), from `ratios` on. All samples are kept meanwhile: those of some thousand vertices
     are enough."""
     kept = on_cores(lambda i: list(chunks(of, i)), range(len(of.views)))
-    for _ in range(LIGHT_SWEEPS):
+
+    def sweep(ratios: list[Float]) -> list[Float]:
         sums = _sums(of, ratios, kept.__getitem__)
         tint = _tint(sums)
         albedo = _albedo(sums, tint)
-        of_lights = on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tint), range(len(kept)))  # noqa: B023
-        ratios = _ratios(of_lights, one_rig)
+        return _ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tint), range(len(kept))), one_rig)
+
+    for _ in range(LIGHT_SWEEPS):
+        ratios = sweep(ratios)
     return ratios
 
 
