@@ -9,6 +9,7 @@ The rounds
 
 Samples
     observe.py           what the photographs say about the vertices
+    reflectance.py       the same in colour, with all that predicts them but colour
     thinned.py           fewer lights of every view
     pixels.py            normals of single views at their pixels
 
@@ -20,8 +21,7 @@ Vertices and lights
     lighting.py          a round's lights and law
     shadowed.py          light between surfaces, told deep in shadow
     grey.py              lights without their colours, and with them
-    reflectance.py       colours of the lights
-    colours.py           colours of body and lobes
+    colours.py           colours of body, lobes and lights
 
 The model
     choosing.py          its components on trial
