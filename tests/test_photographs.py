@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mvps.calibrate import colour_ratios
 from mvps.checks.photographs import photographs
-from mvps.joint.reflectance import _ratios
+from mvps.joint.colours import _ratios
 from mvps.scene import Capture, View
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
