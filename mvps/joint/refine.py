@@ -267,7 +267,8 @@ def _coloured(state: State, settings: RefineSettings, generator: np.random.Gener
         state.trials.append(trial)
     material, told = material_of(state, albedo), scatter(observed, samples_noise(observed.capture))
     normal = own_normals(material.normal, told.noise, observed)
-    certain = np.where(np.isfinite(albedo).all(1), stated_errors(told, normal, state.surface, OWN_SHARE, WEAK_TIE), 0)
+    certain = stated_errors(told, normal, state.surface, OWN_SHARE, WEAK_TIE, len(observed.views) == 1)
+    certain = np.where(np.isfinite(albedo).all(1), certain, 0)
     material = replace(material, normal=normal, confidence=certain, residual=residual)
     return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
 

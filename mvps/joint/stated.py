@@ -23,6 +23,8 @@ those beside it,
 Where samples say nothing n is the surface's, and a says nothing either. There t stands in: the tie T of n to the surface, but no more than
 DEVIATIONS of the median sigma that comes out with it.
 
+The surface of a single view is the integral of these normals and no mean over others: there p = 1, variances are averaged, and t = T.
+
 No constant is fitted to true normals; the form was chosen with true normals in view (docs/findings/normals.md).
 """
 
@@ -84,22 +86,26 @@ def scatter(of: Observed, noise: float) -> Scatter:
     return Scatter(*(torch.where(known, v, torch.nan).double().cpu().numpy() for v in values))
 
 
-def stated_errors(told: Scatter, normal: Float, surface: Surface, share: float, tie: float) -> Float:
+def stated_errors(told: Scatter, normal: Float, surface: Surface, share: float, tie: float, one_view: bool = False) -> Float:
     """(V,) confidence (scene.py) in the normals that a result is shaded with, 0 without samples.
 
-    normal (V, 3), unit, without pixels' blur: the vertices' own, of which `share` is in what is shaded; tie: T, radians.
+    normal (V, 3), unit, without pixels' blur: the vertices' own, of which `share` is in what is shaded; tie: T, radians. one_view: the
+    surface is one view's.
     """
     seen, ends = np.isfinite(told.noise), edges(surface)
     if not seen.any():
         return np.zeros(len(seen))
-    variance = np.where(seen, told.shared + share**2 * told.photographs, MOST_VARIANCE).clip(LEAST_VARIANCE, MOST_VARIANCE)
+    in_shaded = 1.0 if one_view else share
+    variance = np.where(seen, told.shared + in_shaded**2 * told.photographs, MOST_VARIANCE).clip(LEAST_VARIANCE, MOST_VARIANCE)
     apart = ((normal - vertex_normals(surface)) ** 2).sum(1) / 2
-    precision, around = averaged(np.column_stack([1 / variance, apart]), seen, ends).T
+    power = 1 if one_view else -1
+    mean, around = averaged(np.column_stack([variance**power, apart]), seen, ends).T
+    precision = mean.clip(LEAST_VARIANCE) ** -power
 
     def error(otherwise: float) -> Float:
         return np.where(seen, np.sqrt(1 / (precision + 1 / otherwise**2) + around), np.inf)
 
-    otherwise = min(tie, DEVIATIONS * float(np.median(error(tie)[seen])))
+    otherwise = tie if one_view else min(tie, DEVIATIONS * float(np.median(error(tie)[seen])))
     return confidence_of(torch.from_numpy(error(otherwise))).numpy()
 
 
