@@ -129,11 +129,11 @@ def test_noise_of_photographs_counts_by_the_normals_share(scene: SphereScene) ->
     assert 1.25 * rms[1] < rms[0] and rms[1] < 1.25 * rms[2]
 
 
-def test_vertices_whose_samples_say_little_are_known_from_those_beside_them(scene: SphereScene) -> None:
-    """Among neighbours that are known to a degree, some that samples say nearly nothing of are not as far off as the tie would have it."""
+def with_one_light(scene: SphereScene, few: torch.Tensor) -> tuple[Float, Float]:
+    """Stated errors, deg, of the vertices `few` (V,), whose normals are the surface's and whose samples are one a view, and of the others,
+    which are known to a degree."""
     views, truth, lights = photographed(scene)
     draw = torch.Generator().manual_seed(0)
-    few = torch.rand(len(truth.normal), generator=draw) < 0.1
     noisy = [
         replace(s, image=s.image + independent(s, draw), data=s.data & ~(few[s.vertex, None] & (torch.arange(s.image.shape[1]) > 0)))
         for s in views
@@ -142,7 +142,20 @@ def test_vertices_whose_samples_say_little_are_known_from_those_beside_them(scen
     turned = replace(found, normal=torch.where(few[:, None], truth.normal, found.normal))
     stated = stated_deg(scene, noisy, turned, lights)
     known = np.isfinite(stated)
-    assert stated[known & few.numpy()].max() < 3 * np.median(stated[known & ~few.numpy()])
+    return stated[known & few.numpy()], stated[known & ~few.numpy()]
+
+
+def test_single_vertices_whose_samples_say_little_are_known_from_those_beside_them(scene: SphereScene) -> None:
+    """As well as these (1.01 times); with variances averaged in place of precisions 1.4 times worse."""
+    draw = torch.Generator().manual_seed(0)
+    little, others = with_one_light(scene, torch.rand(len(scene.reconstruction.surface.vertices), generator=draw) < 0.1)
+    assert np.median(little) < 1.2 * np.median(others) and little.max() < 3 * np.median(others)
+
+
+def test_a_patch_whose_samples_say_little_is_known_to_three_medians(scene: SphereScene) -> None:
+    """What vertices contradict the surface by comes on top (3.2); without that bound 7.1."""
+    little, others = with_one_light(scene, torch.tensor(scene.reconstruction.surface.vertices[:, 2] > 25.0))
+    assert little.max() < 3.5 * np.median(others)
 
 
 def test_where_no_samples_tell_the_tie_stands_in(scene: SphereScene) -> None:

@@ -73,11 +73,10 @@ def _sums(of: Observed, ratios: Sequence[Float], samples_of: Callable[[int], Ite
         for chunk in samples_of(i):
             w, q, S, y = chunk.weight / scale[chunk.rows, None] ** 2, chunk.basis, chunk.predicted - chunk.diffuse, chunk.image / ratio
             if more is None:
-                of_body = (w * q * q).sum(1, keepdims=True), (w * q * S).sum(1, keepdims=True), _over_lights(w * q, y)
+                qq, qS, qy = (w * q * q).sum(1, keepdims=True), (w * q * S).sum(1, keepdims=True), _over_lights(w * q, y)
             else:
                 q_c = q[..., None] + more(chunk.part)
-                of_body = _over_lights(w, q_c * q_c), _over_lights(w * S, q_c), _over_lights(w, q_c * y)
-            qq, qS, qy = of_body
+                qq, qS, qy = _over_lights(w, q_c * q_c), _over_lights(w * S, q_c), _over_lights(w, q_c * y)
             sums = qq, qS, (w * S * S).sum(1, keepdims=True), qy, _over_lights(w * S, y), _over_lights(w, y * y)
             for total, of_chunk in zip(out, sums, strict=True):
                 total[chunk.part] = of_chunk

@@ -95,17 +95,16 @@ def stated_errors(told: Scatter, normal: Float, surface: Surface, share: float, 
     seen, ends = np.isfinite(told.noise), edges(surface)
     if not seen.any():
         return np.zeros(len(seen))
-    in_shaded = 1.0 if one_view else share
-    variance = np.where(seen, told.shared + in_shaded**2 * told.photographs, MOST_VARIANCE).clip(LEAST_VARIANCE, MOST_VARIANCE)
+    share, power, most = (1.0, 1, np.inf) if one_view else (share, -1, DEVIATIONS)
+    variance = np.where(seen, told.shared + share**2 * told.photographs, MOST_VARIANCE).clip(LEAST_VARIANCE, MOST_VARIANCE)
     apart = ((normal - vertex_normals(surface)) ** 2).sum(1) / 2
-    power = 1 if one_view else -1
     mean, around = averaged(np.column_stack([variance**power, apart]), seen, ends).T
     precision = mean.clip(LEAST_VARIANCE) ** -power
 
     def error(otherwise: float) -> Float:
         return np.where(seen, np.sqrt(1 / (precision + 1 / otherwise**2) + around), np.inf)
 
-    otherwise = tie if one_view else min(tie, DEVIATIONS * float(np.median(error(tie)[seen])))
+    otherwise = min(tie, most * float(np.median(error(tie)[seen])))
     return confidence_of(torch.from_numpy(error(otherwise))).numpy()
 
 
