@@ -17,7 +17,13 @@ of robust sums over what is predicted,
 
     r_lc = sum w radiance_c (a_c q + t_c S) / sum w (a_c q + t_c S)^2,     w = (diffuse part / all)^2   on top of the robust weights
 
-because lobes may have other colours still. One factor per channel is free: r has mean one over the lights.
+because lobes may have other colours still. One factor per channel is free where all has the body's colour. Lights as such are taken for
+white on average, of which n have a mean r of one within sigma / sqrt(n), sigma their own scatter. Highlights of all but metals have the
+colour of their light (Shafer 1985), so that under such lights t is the mean of r, with the variance that the sums above give it,
+
+    mean r_c = 1 + (t_c - 1) v / (v + 1 / H_c),   v = sigma^2 / n,   H_c = sum_v (<S S> - <q_c S>^2 / <q_c q_c>)
+
+unless some t_c is further from white than three standard deviations of that: then it is the lobes' own.
 """
 
 from __future__ import annotations
@@ -48,6 +54,9 @@ LIGHT_SWEEPS = 3
 """Of lights' colours in turn with the others; every round goes on from those of the last."""
 
 WHITE = (1.0, 1.0, 1.0)
+
+BY_CHANCE = 3.0
+"""Standard deviations that the mean colour of lights which are white on average is from white at most."""
 
 Single = NDArray[np.float32]
 
@@ -115,8 +124,8 @@ def _albedo(sums: _Sums, tint: Float) -> Float:
     return np.maximum((sums.qy - tint * sums.qS) / np.maximum(sums.qq, np.finfo(float).tiny), 0)
 
 
-def _tint(sums: _Sums) -> Float:
-    """(3,) colour of the lobes; white where there are none."""
+def _tint(sums: _Sums) -> tuple[Float, Float]:
+    """Colour (3,) of the lobes, white where there are none, and its variance."""
     seen = (sums.qq > 0).all(1)
     qq, qS, SS, qy, Sy = (values[seen] for values in (sums.qq, sums.qS, sums.SS, sums.qy, sums.Sy))
     tint = np.ones(3)
@@ -127,7 +136,7 @@ def _tint(sums: _Sums) -> Float:
         # Lobes that shine like the body cannot be told from it.
         known = bottom > 1e-6 * SS.sum(0)
         tint = np.where(known, np.maximum(top, 0) / np.where(known, bottom, 1), 1.0)
-    return tint
+    return tint, np.where(known, 1 / np.where(known, bottom, 1), np.inf)
 
 
 def _errors(kept: _Sums, albedo: Float, tint: Float) -> Float:
@@ -145,7 +154,7 @@ def lobes_in_colour(of: Observed, ratios: Sequence[Float], some: torch.Tensor) -
     few = [samples.of_pairs(chosen[samples.vertex].nonzero()[:, 0]) for samples in of.views]
     parts = (of._replace(views=views) for views in parted(few))
     fitted, kept = (_sums(part, ratios, partial(chunks, part)) for part in parts)
-    white, tint = np.array(WHITE), _tint(fitted)
+    white, (tint, _) = np.array(WHITE), _tint(fitted)
     before, after = (_errors(kept, _albedo(fitted, t), t) for t in (white, tint))
     return replace(judged("lobes in a colour of their own", before, after), seconds=time.perf_counter() - start)
 
@@ -156,7 +165,7 @@ def colours(of: Observed, ratios: Sequence[Float], coloured_lobes: bool, sent: S
     sent: what diffuse surfaces send light on by, in colour; None: what arrives counts as grey.
     """
     sums = _sums(of, ratios, partial(chunks, of), sent)
-    tint = _tint(sums) if coloured_lobes else np.array(WHITE)
+    tint = _tint(sums)[0] if coloured_lobes else np.array(WHITE)
     return np.where(sums.qq > 0, _albedo(sums, tint), np.nan), tint
 
 
@@ -167,13 +176,36 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
 
     def sweep(ratios: list[Float]) -> list[Float]:
         sums = _sums(of, ratios, kept.__getitem__)
-        tint = _tint(sums)
+        tint, variance = _tint(sums)
         albedo = _albedo(sums, tint)
-        return _ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tint), range(len(kept))), one_rig)
+        solved = _white(_ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tint), range(len(kept))), one_rig))
+        # The tint is that under lights which were perhaps not white on average.
+        under = np.concatenate(ratios).mean(0)
+        mean = _mean_colour(solved[0] if one_rig else np.concatenate(solved), under * tint, under**2 * variance)
+        return [_relative(ratio * mean) for ratio in solved]
 
     for _ in range(LIGHT_SWEEPS):
         ratios = sweep(ratios)
     return ratios
+
+
+def ratios_before(of: Observed, albedo: Float, tint: Float, one_rig: bool) -> list[Float]:
+    """Per view the channel ratios (lights, 3) of lights in front of a known object: albedo (V, 3), lobes' colour (3,)."""
+    counts = [len(lights.intensity) for lights in of.lights]
+    return _ratios(on_cores(lambda i: _of_lights(chunks(of, i), counts[i], albedo, tint), range(len(of.views))), one_rig)
+
+
+def _mean_colour(ratios: Float, tint: Float, variance: Float) -> Float:
+    """Mean (3,) of lights' colours (lights, 3) that are white on average, and under which lobes would have the colour `tint`, which is known
+    up to `variance`."""
+    level = tint.mean()
+    if len(ratios) < 2 or not (level > 0 and np.isfinite(variance).all()):
+        return np.ones(3)
+    beyond, certain = tint / level - 1, variance / level**2
+    chance = ratios.var(0, ddof=1).mean() / len(ratios)
+    if (beyond**2 > BY_CHANCE**2 * (chance + certain)).any():
+        return np.ones(3)
+    return np.asarray(1 + beyond * chance / np.maximum(chance + certain, np.finfo(float).tiny))
 
 
 def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float) -> tuple[Float, Float]:
@@ -190,13 +222,21 @@ def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float)
 
 
 def _ratios(sums: list[tuple[Float, Float]], one_rig: bool) -> list[Float]:
+    """r (lights, 3) of every view."""
     if one_rig:
         sums = [(np.sum([t for t, _ in sums], axis=0), np.sum([b for _, b in sums], axis=0))] * len(sums)
     ratios = [top / np.maximum(bottom, 1e-300) for top, bottom in sums]
     # Of a photograph that was left out no sample speaks: white.
     ratios = [np.where(ratio.sum(1, keepdims=True) > 0, ratio, 1.0) for ratio in ratios]
-    ratios = [ratio / np.maximum(ratio.mean(1, keepdims=True), 1e-300) for ratio in ratios]
-    # A common tint of all lights is a tint of the object: the convention is lights that are white on average.
+    return [_relative(ratio) for ratio in ratios]
+
+
+def _white(ratios: list[Float]) -> list[Float]:
+    """White on average: a common tint of all lights may be a tint of the object."""
     tint = np.mean(np.concatenate(ratios), axis=0)
-    ratios = [ratio / tint for ratio in ratios]
-    return [ratio / ratio.mean(1, keepdims=True) for ratio in ratios]
+    return [_relative(ratio / tint) for ratio in ratios]
+
+
+def _relative(ratio: Float) -> Float:
+    """Over the channels' mean."""
+    return np.asarray(ratio / np.maximum(ratio.mean(1, keepdims=True), 1e-300))

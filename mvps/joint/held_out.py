@@ -11,7 +11,7 @@ import torch
 
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
-from mvps.joint.colours import light_ratios
+from mvps.joint.colours import WHITE, ratios_before
 from mvps.joint.lighting import LIGHT_VERTICES, drawn
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.reflectance import Observed
@@ -23,6 +23,12 @@ STEPS = 6
 def carried_over(lights: Lights, rotations: list[Float], rotation: Float) -> tuple[Float, Float]:
     """Direction and intensity (lights, 3) of a rig's lights in a view with camera_from_world `rotation`, from its first view."""
     return np.asarray(lights.direction[0]) @ rotations[0].T @ rotation, np.asarray(lights.intensity[0])
+
+
+def _tint(material: Material) -> Float:
+    """Colour (3,) of the lobes, one for the object."""
+    weight = material.specular_weight
+    return np.asarray(weight.sum((0, 1)) / weight.sum((0, 1)).mean()) if weight.ndim == 3 and weight.any() else np.array(WHITE)
 
 
 def _vertices(material: Material, device: torch.device) -> Vertices:
@@ -111,8 +117,8 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
             views = with_gathered(views, capture, surface, sent, lights)
         for _ in range(STEPS):
             grey = _step(views, vertices, grey, material.law, rotations, one_rig)
-    ratios = [channel_ratio(e) for e in white]
     some = drawn(views, LIGHT_VERTICES, np.random.default_rng(0))
     rows = [samples.of_vertices(some, len(vertices.normal)) for samples in views]
-    ratios = light_ratios(Observed(capture, surface, rows, vertices, grey, material.law), ratios, one_rig)
+    of = Observed(capture, surface, rows, vertices, grey, material.law)
+    ratios = ratios_before(of, material.albedo, _tint(material), one_rig)
     return _as_lights(grey, ratios, one_rig)
