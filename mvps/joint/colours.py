@@ -196,7 +196,7 @@ def ratios_before(of: Observed, albedo: Float, tint: Float, one_rig: bool) -> li
 
 
 def _mean_colour(ratios: Float, tint: Float, variance: Float) -> Float:
-    """Mean (3,) of lights' colours (lights, 3) that are white on average, and under which lobes would have the colour `tint`, which is known
+    """Mean (3,) of lights' colours, from `ratios` (lights, 3), white on average, under which lobes would have the colour `tint`, known
     up to `variance`."""
     level = tint.mean()
     if len(ratios) < 2 or not (level > 0 and np.isfinite(variance).all()):
