@@ -44,13 +44,14 @@ def make_sphere(
     coloured_lobes: bool = False,
     seed: int = 0,
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    tint_left: tuple[float, float, float] | None = None,
     seen_from: Sequence[Sequence[float]] = AXES,
     waves: float = 0.1,
     side: int = 1,
 ) -> SphereScene:
     """Views from these directions, ten lights of one rig; the refined normals are waves on the sphere's, up to about 10 degrees off.
 
-    tint: colour of the lobes where they are coloured; waves: radians; side: rays along a pixel's side.
+    tint: colour of the lobes where they are coloured, tint_left: of those left, if others; waves: radians; side: rays along a pixel's side.
     """
     rng = np.random.default_rng(seed)
     ball = trimesh.creation.icosphere(subdivisions=subdivisions, radius=RADIUS)
@@ -58,7 +59,8 @@ def make_sphere(
     outward = normalise(surface.vertices)
     shift = waves * np.sin(surface.vertices[:, [1, 2, 0]] / 8)
     weight = np.full((len(outward), 2), 0.15)
-    weight = weight[..., None] * np.array(tint) if coloured_lobes else weight
+    of_lobes = np.where(surface.vertices[:, :1] < 0, tint_left or tint, tint)
+    weight = weight[..., None] * of_lobes[:, None] if coloured_lobes else weight
     material = Material(normalise(outward + shift), colours(surface.vertices), weight, np.array([12.0, 60.0]), np.ones(len(outward)))
     cameras = [camera_at(np.array(d, float)) for d in seen_from]
     tilt = rng.normal(0, 0.5, (10, 2))

@@ -5,15 +5,24 @@ weights w_k shows
 
     y_c = a_c q_c + t_c S,     q_c = dI/da + e b (G_c - G),     S = sum_k w_k q_k   (blocks.py)
 
-where t is the lobes' colour, one for the object: white on dielectrics, the body's on metals. Once albedos are known, what diffuse surfaces
+where t is the lobes' colour: white on dielectrics, the body's on metals. Once albedos are known, what diffuse surfaces
 send has their colour, b G_c (bounce.py); where lobes take part in it (gleam.py) it counts as grey. Every vertex's albedo is eliminated
 (variable projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance,
 
     a_c = (<q_c y_c> - t_c <q_c S>) / <q_c q_c>,   at least 0
-    t_c = sum_v (<S y_c> - a0_c <q_c S>) / sum_v (<S S> - <q_c S>^2 / <q_c q_c>),   a0 = <q y> / <q q>;  where a is at its bound, without a0
 
-Lobes stay white unless a colour predicts held-out lights better (material.py). Lights' colours are solved in turn with these two, as ratios
-of robust sums over what is predicted,
+One t for the object is, with a0 = <q y> / <q q> and H_vc = <S S> - <q_c S>^2 / <q_c q_c>,
+
+    t_c = sum_v g_vc / sum_v H_vc,   g_vc = <S y_c> - a0_c <q_c S>   where a is at its bound, without a0, and H = <S S>
+
+and an object of several materials has, around that, places with colours of variance tau_c^2, which is what their g_vc scatter by beyond
+their own variance H_vc (DerSimonian and Laird 1986; a place of which g says little has the object's colour):
+
+    tau_c^2 = (sum_v (g_vc - H_vc t_c)^2 / H_vc - (V - 1)) / (sum_v H_vc - sum_v H_vc^2 / sum_v H_vc),   at least 0
+    t_vc = t_c + tau_c^2 (g_vc - H_vc t_c) / (1 + H_vc tau_c^2),   at least 0
+
+Lobes stay white unless a colour predicts held-out lights better (material.py), and have one colour unless several do. Lights' colours are
+solved in turn with these two, as ratios of robust sums over what is predicted,
 
     r_lc = sum w radiance_c (a_c q + t_c S) / sum w (a_c q + t_c S)^2,     w = (diffuse part / all)^2   on top of the robust weights
 
@@ -21,7 +30,7 @@ because lobes may have other colours still. One factor per channel is free where
 white on average, of which n have a mean r of one within sigma / sqrt(n), sigma their own scatter. Highlights of all but metals have the
 colour of their light (Shafer 1985), so that under such lights t is the mean of r, with the variance that the sums above give it,
 
-    mean r_c = 1 + (t_c - 1) v / (v + 1 / H_c),   v = sigma^2 / n,   H_c = sum_v (<S S> - <q_c S>^2 / <q_c q_c>)
+    mean r_c = 1 + (t_c - 1) v / (v + 1 / H_c),   v = sigma^2 / n,   H_c = sum_v H_vc
 
 unless some t_c is further from white than three standard deviations of that: then it is the lobes' own.
 """
@@ -31,6 +40,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from enum import Enum
 from functools import partial
 from typing import NamedTuple
 
@@ -52,6 +62,11 @@ BOUND_SWEEPS = 4
 
 LIGHT_SWEEPS = 3
 """Of lights' colours in turn with the others; every round goes on from those of the last."""
+
+ALIKE = 1e-6
+"""Part of the lobes' squares beyond the body's that tells them apart; single precision leaves 1e-7 of where they shine alike."""
+
+TINY = np.finfo(float).tiny
 
 WHITE = (1.0, 1.0, 1.0)
 
@@ -120,23 +135,36 @@ def _beyond_grey(of: Observed, sent: Senders) -> Callable[[int], Callable[[slice
 
 
 def _albedo(sums: _Sums, tint: Float) -> Float:
-    """(V, 3), 0 for a vertex without samples."""
-    return np.maximum((sums.qy - tint * sums.qS) / np.maximum(sums.qq, np.finfo(float).tiny), 0)
+    """(V, 3), 0 for a vertex without samples. tint (3,) or (V, 3)."""
+    return np.maximum((sums.qy - tint * sums.qS) / np.maximum(sums.qq, TINY), 0)
+
+
+def _lobes_alone(sums: _Sums, tint: Float) -> tuple[Float, Float]:
+    """H and g (V, 3), zeros where lobes cannot be told from the body; tint (3,) tells which vertices have none."""
+    body: Bool = sums.qy - tint * sums.qS > 0
+    part = np.where(body, sums.qS / np.maximum(sums.qq, TINY), 0)
+    H, g = sums.SS - part * sums.qS, sums.Sy - part * sums.qy
+    known = (H > ALIKE * sums.SS) & (sums.qq > 0)
+    return np.where(known, H, 0), np.where(known, g, 0)
 
 
 def _tint(sums: _Sums) -> tuple[Float, Float]:
-    """Colour (3,) of the lobes, white where there are none, and its variance."""
-    seen = (sums.qq > 0).all(1)
-    qq, qS, SS, qy, Sy = (values[seen] for values in (sums.qq, sums.qS, sums.SS, sums.qy, sums.Sy))
+    """The lobes' colour (3,), one for the object and white where there are none, and its variance."""
     tint = np.ones(3)
     for _ in range(BOUND_SWEEPS):
-        body: Bool = qy - tint * qS > 0
-        top = (Sy - np.where(body, qy * qS / qq, 0)).sum(0)
-        bottom = np.where(body, SS - qS**2 / qq, SS).sum(0)
-        # Lobes that shine like the body cannot be told from it.
-        known = bottom > 1e-6 * SS.sum(0)
-        tint = np.where(known, np.maximum(top, 0) / np.where(known, bottom, 1), 1.0)
-    return tint, np.where(known, 1 / np.where(known, bottom, 1), np.inf)
+        H, g = (values.sum(0) for values in _lobes_alone(sums, tint))
+        tint = np.where(H > 0, np.maximum(g, 0) / np.where(H > 0, H, 1), 1.0)
+    return tint, np.where(H > 0, 1 / np.where(H > 0, H, 1), np.inf)
+
+
+def _tints(sums: _Sums, tint: Float) -> Float:
+    """Colours (V, 3) of every vertex' lobes, around the object's (3,)."""
+    H, g = _lobes_alone(sums, tint)
+    beyond, total = g - H * tint, H.sum(0)
+    chance = (beyond**2 / np.maximum(H, TINY)).sum(0) - np.maximum((H > 0).sum(0) - 1, 0)
+    variance = np.maximum(chance, 0) / np.maximum(total - (H**2).sum(0) / np.maximum(total, TINY), TINY)
+    of_each: Float = np.maximum(tint + variance * beyond / (1 + variance * H), 0)
+    return of_each
 
 
 def _errors(kept: _Sums, albedo: Float, tint: Float) -> Float:
@@ -146,26 +174,50 @@ def _errors(kept: _Sums, albedo: Float, tint: Float) -> Float:
     return np.where(level > 0, np.sqrt(np.maximum(square.sum(1), 0) / np.where(level > 0, level, 1)), np.nan)
 
 
-def lobes_in_colour(of: Observed, ratios: Sequence[Float], some: torch.Tensor) -> Trial:
-    """Whether lobes in a colour of their own predict the lights held out (trial.py) better than white ones, on some vertices."""
+class LobeColour(Enum):
+    """What colour lobes have: that of their light, one for the object, or one for every vertex."""
+
+    WHITE = "white"
+    ONE = "one"
+    EACH = "each"
+
+
+def _of_kind(kind: LobeColour, sums: _Sums) -> Float:
+    """(V, 3) colours of the lobes."""
+    if kind is LobeColour.WHITE:
+        return np.ones_like(sums.qq)
+    tint, _ = _tint(sums)
+    return _tints(sums, tint) if kind is LobeColour.EACH else np.tile(tint, (len(sums.qq), 1))
+
+
+def lobes_in_colour(of: Observed, ratios: Sequence[Float], some: torch.Tensor) -> tuple[LobeColour, list[Trial]]:
+    """Which colours of lobes predict the lights held out (trial.py) best, on some vertices."""
     start = time.perf_counter()
     chosen = torch.zeros(len(of.vertices.normal), dtype=torch.bool, device=some.device)
     chosen[some] = True
     few = [samples.of_pairs(chosen[samples.vertex].nonzero()[:, 0]) for samples in of.views]
     parts = (of._replace(views=views) for views in parted(few))
     fitted, kept = (_sums(part, ratios, partial(chunks, part)) for part in parts)
-    white, (tint, _) = np.array(WHITE), _tint(fitted)
-    before, after = (_errors(kept, _albedo(fitted, t), t) for t in (white, tint))
-    return replace(judged("lobes in a colour of their own", before, after), seconds=time.perf_counter() - start)
+
+    def error(kind: LobeColour) -> Float:
+        tint = _of_kind(kind, fitted)
+        return _errors(kept, _albedo(fitted, tint), tint)
+
+    found, trials = LobeColour.WHITE, []
+    for kind, name in ((LobeColour.ONE, "lobes in a colour of their own"), (LobeColour.EACH, "lobes in a colour of every place")):
+        trial = judged(name, error(found), error(kind))
+        trials.append(replace(trial, seconds=time.perf_counter() - start))
+        found, start = kind if trial.kept else found, time.perf_counter()
+    return found, trials
 
 
-def colours(of: Observed, ratios: Sequence[Float], coloured_lobes: bool, sent: Senders | None = None) -> tuple[Float, Float]:
-    """Albedo (V, 3), NaN where no view sees the vertex, and the lobes' colour (3,), under lights of known channel ratios (lights, 3).
+def colours(of: Observed, ratios: Sequence[Float], kind: LobeColour, sent: Senders | None = None) -> tuple[Float, Float]:
+    """Albedo (V, 3), NaN where no view sees the vertex, and the lobes' colour (V, 3), under lights of known channel ratios (lights, 3).
 
     sent: what diffuse surfaces send light on by, in colour; None: what arrives counts as grey.
     """
     sums = _sums(of, ratios, partial(chunks, of), sent)
-    tint = _tint(sums)[0] if coloured_lobes else np.array(WHITE)
+    tint = _of_kind(kind, sums)
     return np.where(sums.qq > 0, _albedo(sums, tint), np.nan), tint
 
 
@@ -177,8 +229,9 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
     def sweep(ratios: list[Float]) -> list[Float]:
         sums = _sums(of, ratios, kept.__getitem__)
         tint, variance = _tint(sums)
-        albedo = _albedo(sums, tint)
-        solved = _white(_ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tint), range(len(kept))), one_rig))
+        tints = _tints(sums, tint)
+        albedo = _albedo(sums, tints)
+        solved = _white(_ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tints), range(len(kept))), one_rig))
         # The tint is that under lights which were perhaps not white on average.
         under = np.concatenate(ratios).mean(0)
         mean = _mean_colour(solved[0] if one_rig else np.concatenate(solved), under * tint, under**2 * variance)
@@ -190,7 +243,7 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
 
 
 def ratios_before(of: Observed, albedo: Float, tint: Float, one_rig: bool) -> list[Float]:
-    """Per view the channel ratios (lights, 3) of lights in front of a known object: albedo (V, 3), lobes' colour (3,)."""
+    """Per view the channel ratios (lights, 3) of lights in front of a known object: albedo and lobes' colour (V, 3)."""
     counts = [len(lights.intensity) for lights in of.lights]
     return _ratios(on_cores(lambda i: _of_lights(chunks(of, i), counts[i], albedo, tint), range(len(of.views))), one_rig)
 
@@ -209,12 +262,12 @@ def _mean_colour(ratios: Float, tint: Float, variance: Float) -> Float:
 
 
 def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float) -> tuple[Float, Float]:
-    """Numerators and denominators of r (count, 3) of a view's samples, for albedo (V, 3) and the lobes' colour (3,)."""
+    """Numerators and denominators of r (count, 3) of a view's samples, for albedo and the lobes' colour (V, 3)."""
     top, bottom = np.zeros((2, count, 3))
     body, lobes = albedo.astype(np.float32), tint.astype(np.float32)
     for chunk in of_view:
         weight = chunk.weight * (chunk.diffuse / np.maximum(chunk.predicted, 1e-12)) ** 2
-        shown = chunk.basis[..., None] * body[chunk.rows, None] + (chunk.predicted - chunk.diffuse)[..., None] * lobes
+        shown = chunk.basis[..., None] * body[chunk.rows, None] + (chunk.predicted - chunk.diffuse)[..., None] * lobes[chunk.rows, None]
         weighted = weight[..., None] * shown
         top += np.einsum("plc,plc->lc", weighted, chunk.image)
         bottom += np.einsum("plc,plc->lc", weighted, shown)

@@ -11,7 +11,7 @@ import torch
 
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
-from mvps.joint.colours import WHITE, ratios_before
+from mvps.joint.colours import ratios_before
 from mvps.joint.lighting import LIGHT_VERTICES, drawn
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.reflectance import Observed
@@ -26,9 +26,13 @@ def carried_over(lights: Lights, rotations: list[Float], rotation: Float) -> tup
 
 
 def _tint(material: Material) -> Float:
-    """Colour (3,) of the lobes, one for the object."""
+    """Colour (V, 3) of the lobes; white where there are none."""
     weight = material.specular_weight
-    return np.asarray(weight.sum((0, 1)) / weight.sum((0, 1)).mean()) if weight.ndim == 3 and weight.any() else np.array(WHITE)
+    if weight.ndim == 2:
+        return np.ones_like(material.albedo)
+    total = weight.sum(1)
+    mean = total.mean(1, keepdims=True)
+    return np.where(mean > 0, total / np.where(mean > 0, mean, 1), 1.0)
 
 
 def _vertices(material: Material, device: torch.device) -> Vertices:

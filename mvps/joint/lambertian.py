@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 
 from mvps.joint.blocks import Vertices
-from mvps.joint.colours import colours
+from mvps.joint.colours import LobeColour, colours
 from mvps.joint.grey import grey_lights
 from mvps.joint.observe import channel_ratio, observe
 from mvps.joint.reflectance import Observed
@@ -33,5 +33,5 @@ def lambertian(capture: Capture, lights: Lights, surface: Surface, device: torch
     vertices = vertex_steps(views, vertices, grey, law, free_reflectance(normal, HELD, 1), STEPS)
     state = State(surface, lights, (), law, Model(), 0.0, vertices, views=views)
     observed = Observed(capture, surface, views, vertices, grey, law)
-    coloured, _ = colours(observed, [channel_ratio(e) for e in lights.intensity], False)
+    coloured, _ = colours(observed, [channel_ratio(e) for e in lights.intensity], LobeColour.WHITE)
     return material_of(state, coloured)

@@ -19,7 +19,7 @@ from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
 from mvps.joint.choosing import TRIAL_VERTICES
-from mvps.joint.colours import colours, lobes_in_colour
+from mvps.joint.colours import LobeColour, colours, lobes_in_colour
 from mvps.joint.detail import detailed, interpolated
 from mvps.joint.fused import face_targets
 from mvps.joint.grey import grey_lights
@@ -252,25 +252,25 @@ def _coloured(state: State, settings: RefineSettings, generator: np.random.Gener
     and normals without pixels' blur."""
     observed, lights = _observed(state)
     ratios = [channel_ratio(e) for e in lights.intensity]
-    coloured_lobes = False
+    kind = LobeColour.WHITE
     if state.law.sharpness:
-        state.trials.append(lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator)))
-        coloured_lobes = state.trials[-1].kept
-    albedo, tint = colours(observed, ratios, coloured_lobes)
+        kind, trials = lobes_in_colour(observed, ratios, drawn(state.views, TRIAL_VERTICES, generator))
+        state.trials.extend(trials)
+    albedo, tint = colours(observed, ratios, kind)
     # What arrives from coloured surfaces has a colour, with which their albedo would be too strong.
     sent = senders_in_colour(state, albedo)
     if sent is not None:
-        albedo, tint = colours(observed, ratios, coloured_lobes, sent)
+        albedo, tint = colours(observed, ratios, kind, sent)
     residual = None
     if settings.model.neural:
         trial, residual = neural_residual(observed, relative_residuals(observed.views, observed.vertices), POOR_FIT, generator)
         state.trials.append(trial)
-    material, told = material_of(state, albedo), scatter(observed, samples_noise(observed.capture))
+    material = material_of(state, albedo, None if kind is LobeColour.WHITE else tint)
+    told = scatter(observed, samples_noise(observed.capture))
     normal = own_normals(material.normal, told.noise, observed)
     certain = stated_errors(told, normal, state.surface, OWN_SHARE, WEAK_TIE, len(observed.views) == 1)
     certain = np.where(np.isfinite(albedo).all(1), certain, 0)
-    material = replace(material, normal=normal, confidence=certain, residual=residual)
-    return replace(material, specular_weight=material.specular_weight[..., None] * tint) if coloured_lobes else material
+    return replace(material, normal=normal, confidence=certain, residual=residual)
 
 
 def finished(state: State, settings: RefineSettings, account: list[dict[str, float]], generator: np.random.Generator) -> Refined:

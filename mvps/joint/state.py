@@ -94,8 +94,9 @@ def relative_residuals(views: list[ViewSamples], vertices: Vertices) -> torch.Te
     return relative
 
 
-def material_of(state: State, albedo: Float) -> Material:
-    """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal."""
+def material_of(state: State, albedo: Float, tint: Float | None = None) -> Material:
+    """The material on all vertices; where no view sees one it takes the nearest seen vertex's reflectance and the mesh's normal.
+    tint (V, 3): colours of the lobes, white if None."""
     assert state.vertices is not None
     vertices, known = state.vertices, np.isfinite(albedo).all(1)
     if not known.any():
@@ -104,7 +105,8 @@ def material_of(state: State, albedo: Float) -> Material:
     nearest[~known] = np.flatnonzero(known)[neighbours(cKDTree(state.surface.vertices[known]), state.surface.vertices[~known])[1]]
     normal = normalise(vertices.normal.double().cpu().numpy())
     normal[~known] = vertex_normals(state.surface)[~known]
-    weight = vertices.reflectance[:, 1:].double().cpu().numpy()[nearest]
+    weight = vertices.reflectance[:, 1:].double().cpu().numpy()
+    weight = (weight if tint is None else weight[..., None] * tint[:, None])[nearest]
     certain = confidence(vertices).double().cpu().numpy()
     certain, law = np.where(known, certain, 0), state.law
     return Material(
