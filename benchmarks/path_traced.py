@@ -68,6 +68,13 @@ CASES = {
     "coin-patina": Case("coin", "patina", SceneSettings(seed=64)),
     "steps-cloth": Case("steps", "cloth", SceneSettings(seed=65)),
     "gear-copper": Case("gear", "copper", SceneSettings(seed=66)),
+    "lumps-inlaid": Case(201, "inlaid", SceneSettings(seed=201)),
+    "lumps-contrast": Case(202, "contrast", SceneSettings(seed=202, lights=16)),
+    "statue-enamel": Case("statue", "enamel", SceneSettings(seed=204, views=12)),
+    "coral-bronze": Case("coral", "bronze", SceneSettings(seed=206, views=14, lights=16)),
+    "lumps-brushed": Case(207, "brushed", SceneSettings(seed=207)),
+    "cheese-bright": Case("cheese", "bright", SceneSettings(seed=208, views=12)),
+    "statue-wide": Case("statue", "plastic", SceneSettings(seed=209, lights=16, spread=80)),
 }
 
 

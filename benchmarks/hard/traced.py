@@ -232,8 +232,16 @@ def patches(surface: Surface, colours: list[list[float]]) -> NDArray[np.float32]
     return found
 
 
+def inlay(local: Float) -> NDArray[np.float32]:
+    """Share (V,) of the second material of two at points of the unit ball: bands with edges a tenth as wide as they are."""
+    rng = np.random.default_rng(77)
+    waves, phase = 4 * rng.normal(size=(3, 3)), rng.uniform(0, 6, 3)
+    return np.asarray(1 / (1 + np.exp(-np.sin(local @ waves.T + phase).sum(1) / 0.1)), np.float32)
+
+
 PAINT = [[0.55, 0.32, 0.2], [0.3, 0.4, 0.25], [0.6, 0.58, 0.5], [0.2, 0.28, 0.45]]
 COLOURED: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_colour"}
+INLAID: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_inlay"}
 MATT: dict[str, Any] = {"type": "diffuse", "reflectance": COLOURED}
 MATERIALS: dict[str, tuple[dict[str, Any], list[list[float]]]] = {
     "copper": ({"type": "roughconductor", "material": "Cu", "alpha": 0.3, "distribution": "ggx"}, PAINT),
@@ -263,6 +271,47 @@ MATERIALS: dict[str, tuple[dict[str, Any], list[list[float]]]] = {
         [[0.06, 0.05, 0.05], [0.1, 0.08, 0.06], [0.04, 0.05, 0.07]],
     ),
     "plastic": ({"type": "principled", "base_color": COLOURED, "roughness": 0.3, "specular": 0.5}, PAINT),
+    "inlaid": (
+        {
+            "type": "blendbsdf",
+            "weight": INLAID,
+            "a": {"type": "principled", "base_color": COLOURED, "roughness": 0.3, "specular": 0.5},
+            "b": {"type": "roughconductor", "material": "Au", "alpha": 0.25, "distribution": "ggx"},
+        },
+        PAINT,
+    ),
+    "enamel": (
+        {
+            "type": "blendbsdf",
+            "weight": INLAID,
+            "a": {"type": "principled", "base_color": COLOURED, "roughness": 0.7, "specular": 0.3},
+            "b": {"type": "roughconductor", "material": "Cr", "alpha": 0.35, "distribution": "ggx"},
+        },
+        [[0.5, 0.1, 0.08], [0.1, 0.12, 0.4]],
+    ),
+    "contrast": (
+        {"type": "principled", "base_color": COLOURED, "roughness": 0.5, "specular": 0.5},
+        [[0.03, 0.03, 0.03], [0.75, 0.73, 0.7]],
+    ),
+    "bronze": (
+        {"type": "principled", "base_color": COLOURED, "metallic": 0.7, "roughness": 0.4, "specular": 0.5},
+        [[0.45, 0.3, 0.15], [0.3, 0.22, 0.12], [0.2, 0.3, 0.22]],
+    ),
+    "brushed": (
+        {
+            "type": "principled",
+            "base_color": COLOURED,
+            "metallic": 0.3,
+            "roughness": 0.35,
+            "anisotropic": 0.7,
+            "specular": 0.5,
+        },
+        PAINT,
+    ),
+    "bright": (
+        {"type": "principled", "base_color": COLOURED, "roughness": 0.35, "specular": 0.5},
+        [[0.7, 0.03, 0.03], [0.03, 0.5, 0.05], [0.04, 0.06, 0.6], [0.7, 0.65, 0.05]],
+    ),
     "cloth": ({"type": "principled", "base_color": COLOURED, "roughness": 0.9, "specular": 0.2, "sheen": 1.0}, PAINT),
 }
 """BSDF and colours of patches."""
@@ -279,6 +328,7 @@ def traced(surface: Surface, material: str, bounces: int = BOUNCES) -> Photograp
     worn = 1 / (1 + np.exp(-(local.vertices @ np.array([0.3, 0.5, 0.81])) / 0.1))
     made.add_attribute("vertex_colour", 3, colour.ravel().tolist())
     made.add_attribute("vertex_worn", 1, worn.tolist())
+    made.add_attribute("vertex_inlay", 1, inlay(local.vertices).tolist())
     parameters = mi.traverse(made)
     parameters["vertex_positions"] = np.ascontiguousarray(surface.vertices, np.float32).ravel()
     parameters["vertex_normals"] = np.ascontiguousarray(vertex_normals(surface), np.float32).ravel()
