@@ -12,7 +12,7 @@ from test_shadowed import BOUNCE, DIFFUSE, Seen
 
 from mvps.gleam import patches_of, senders
 from mvps.joint.blocks import Vertices
-from mvps.joint.colours import LobeColour, colours, light_ratios, lobes_in_colour, ratios_before
+from mvps.joint.colours import LobeColour, colours, light_ratios, lobes_in_colour, ratios_of_known
 from mvps.joint.grey import grey_lights
 from mvps.joint.observe import channel_ratio, observe
 from mvps.joint.reflectance import Observed
@@ -131,5 +131,5 @@ def test_in_front_of_a_known_object_lights_may_all_be_red(tint: tuple[float, flo
     pictures = [replace(view, samples=np.rint(view.samples * red / red.max()).astype(view.samples.dtype)) for view in of.capture.views]
     of = of._replace(capture=replace(of.capture, views=tuple(pictures)))
     true = ratios[0] * red
-    found = ratios_before(of, albedo, np.tile(tint, (len(albedo), 1)), True)[0]
+    found = ratios_of_known(of, albedo, np.tile(tint, (len(albedo), 1)), True)[0]
     assert np.abs(found / (true / true.mean(1, keepdims=True)) - 1).mean() < 0.005

@@ -5,9 +5,9 @@ weights w_k shows
 
     y_c = a_c q_c + t_c S,     q_c = dI/da + e b (G_c - G),     S = sum_k w_k q_k   (blocks.py)
 
-where t is the lobes' colour: white on dielectrics, the body's on metals. Once albedos are known, what diffuse surfaces
-send has their colour, b G_c (bounce.py); where lobes take part in it (gleam.py) it counts as grey. Every vertex's albedo is eliminated
-(variable projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance,
+where t is the lobes' colour: white on dielectrics, the body's on metals. Once albedos are known, what diffuse surfaces send has their
+colour, b G_c (bounce.py); where lobes take part in it (gleam.py) it counts as grey. Every vertex's albedo is eliminated (variable
+projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance,
 
     a_c = (<q_c y_c> - t_c <q_c S>) / <q_c q_c>,   at least 0
 
@@ -67,8 +67,6 @@ ALIKE = 1e-6
 """Part of the lobes' squares beyond the body's that tells them apart; single precision leaves 1e-7 of where they shine alike."""
 
 TINY = np.finfo(float).tiny
-
-WHITE = (1.0, 1.0, 1.0)
 
 BY_CHANCE = 3.0
 """Standard deviations that the mean colour of lights which are white on average is from white at most."""
@@ -242,7 +240,7 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
     return ratios
 
 
-def ratios_before(of: Observed, albedo: Float, tint: Float, one_rig: bool) -> list[Float]:
+def ratios_of_known(of: Observed, albedo: Float, tint: Float, one_rig: bool) -> list[Float]:
     """Per view the channel ratios (lights, 3) of lights in front of a known object: albedo and lobes' colour (V, 3)."""
     counts = [len(lights.intensity) for lights in of.lights]
     return _ratios(on_cores(lambda i: _of_lights(chunks(of, i), counts[i], albedo, tint), range(len(of.views))), one_rig)
@@ -258,7 +256,7 @@ def _mean_colour(ratios: Float, tint: Float, variance: Float) -> Float:
     chance = ratios.var(0, ddof=1).mean() / len(ratios)
     if (beyond**2 > BY_CHANCE**2 * (chance + certain)).any():
         return np.ones(3)
-    return np.asarray(1 + beyond * chance / np.maximum(chance + certain, np.finfo(float).tiny))
+    return np.asarray(1 + beyond * chance / np.maximum(chance + certain, TINY))
 
 
 def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float) -> tuple[Float, Float]:

@@ -11,7 +11,7 @@ import torch
 
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
-from mvps.joint.colours import ratios_before
+from mvps.joint.colours import ratios_of_known
 from mvps.joint.lighting import LIGHT_VERTICES, drawn
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.reflectance import Observed
@@ -124,5 +124,5 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     some = drawn(views, LIGHT_VERTICES, np.random.default_rng(0))
     rows = [samples.of_vertices(some, len(vertices.normal)) for samples in views]
     of = Observed(capture, surface, rows, vertices, grey, material.law)
-    ratios = ratios_before(of, material.albedo, _tint(material), one_rig)
+    ratios = ratios_of_known(of, material.albedo, _tint(material), one_rig)
     return _as_lights(grey, ratios, one_rig)
