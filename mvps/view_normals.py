@@ -7,13 +7,14 @@ normals, masks and smoothness made. Of the means p + a (m - p) the one nearest t
 
 (James and Stein 1961; Stone 1974 for other data in the truth's place). The truth is not known, but other views' pixels err about it on
 their own: in its place stands the mean r of what the nearest views show there. Of each view's error, with the variance V, m holds a part
-of 1 / n where n views, effectively, show a place, n = (sum w)^2 / sum w^2. So (p - r) . (p - m) has V in the mean, where (p - t) . (p - m)
-has V (1 - 1 / n), and
+s where n views, effectively, show a place, n = (sum w)^2 / sum w^2. So (p - r) . (p - m) has V in the mean, where (p - t) . (p - m) has
+V (1 - s), and
 
-    a = (1 - 1 / n) E[(p - r) . (p - m)] / E|p - m|^2,      between 0 and 1
+    a = (1 - s) E[(p - r) . (p - m)] / E|p - m|^2,      between 0 and 1,      s = 1 / n^2
 
-with means over the vertices around. Where nothing but one view shows a place, p stays. What errs alike in all views, as lights do, shows in
-neither and stays as well.
+with means over the vertices around. A surface that followed the mean of n normals at its place would hold 1 / n, one that is a mean over
+many pixels around, and lies where views agree, next to nothing; the square of the former stands between (docs/findings/normals.md). Where
+nothing but one view shows a place, p stays. What errs alike in all views, as lights do, shows in neither and stays as well.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def drawn_to_surface(capture: Capture, surface: Surface, pictures: list[Picture]
     weights = np.array([one.sees * _facing(one.view, caster.vertex_normals, surface.vertices) for one in views])
     count = weights.sum(0) ** 2 / np.maximum((weights**2).sum(0), np.finfo(float).tiny)
     alone = 1 / np.maximum(np.concatenate([interpolate(surface, h, count) for h in hits]), 1)
-    part = ((1 - alone) * common / np.maximum(apart, np.finfo(float).tiny)).clip(0, 1)
+    part = ((1 - alone**2) * common / np.maximum(apart, np.finfo(float).tiny)).clip(0, 1)
     return on_cores(_drawn, views, pictures, np.split(part, np.cumsum([len(h.face) for h in hits])[:-1]))
 
 
