@@ -133,7 +133,7 @@ def _beyond_grey(of: Observed, sent: Senders) -> Callable[[int], Callable[[slice
 
 
 def _albedo(sums: _Sums, tint: Float) -> Float:
-    """(V, 3), 0 for a vertex without samples. tint (3,) or (V, 3)."""
+    """(V, 3), 0 for a vertex without samples. tint (V, 3)."""
     return np.maximum((sums.qy - tint * sums.qS) / np.maximum(sums.qq, TINY), 0)
 
 
