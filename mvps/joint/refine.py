@@ -18,6 +18,7 @@ from mvps.camera import surface_pixel
 from mvps.cores import neighbours
 from mvps.joint.agreement import Agreement, agreement
 from mvps.joint.blocks import Vertices
+from mvps.joint.borders import shadow_borders, told_by
 from mvps.joint.choosing import TRIAL_VERTICES
 from mvps.joint.colours import LobeColour, colours, lobes_in_colour
 from mvps.joint.detail import detailed, interpolated
@@ -147,6 +148,19 @@ def _agreement_of(state: State, capture: Capture, seen: list[Any], settings: Rou
     return agreed
 
 
+def _told_by_shadows(state: State, pixel: float) -> Callable[[Surface], Agreement]:
+    """Where borders of cast shadows say that vertices lie, of the round's surface wherever it has moved since."""
+    start = state.surface.vertices
+    told = Agreement.of_weights(*np.zeros((2, len(start))))
+    if state.vertices is not None and state.law.shadows:
+        told = told_by(shadow_borders(_observed(state)[0], pixel), state.surface, pixel)
+
+    def of(surface: Surface) -> Agreement:
+        return replace(told, offset=told.offset + ((start - surface.vertices) * vertex_normals(surface)).sum(1))
+
+    return of
+
+
 def _moved(
     surface: Surface, otherwise: Float, state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float
 ) -> Moved:
@@ -154,9 +168,10 @@ def _moved(
     normals where no view sees."""
     floor = POSITION_FLOOR_PIXELS * pixel
     distance = mask_distances(capture)
-    factor, agreement_of = None, _agreement_of(state, capture, seen, settings, pixel)
+    factor, agreement_of, by_shadows = None, _agreement_of(state, capture, seen, settings, pixel), _told_by_shadows(state, pixel)
     for _ in range(settings.fusions):
-        agreed = with_masks(agreement_of(surface), capture, surface, distance, floor)
+        agreed = agreement_of(surface).joined(by_shadows(surface), floor)
+        agreed = with_masks(agreed, capture, surface, distance, floor)
         place = surface.vertices + agreed.offset[:, None] * vertex_normals(surface)
         target = face_targets(capture, surface, state.maps, seen, otherwise)
         surface, factor = fuse(surface, target.normal, agreed, target.sigma, factor)
