@@ -125,3 +125,19 @@ def test_far_rims_are_believed_less(seen: Bowl) -> None:
     same = Borders(np.full(60, 5), np.ones(60), np.full(60, -0.6), np.full(60, 0.3 / pixel), np.zeros(60))
     near, far = (told_by(same._replace(turn=np.full(60, far**2)), seen.surface, pixel).sigma.min() for far in (1.0, 30.0))
     assert RIM_PIXELS * pixel < near < 0.8 * far < np.inf
+
+
+@pytest.mark.parametrize("albedo", [0.0, 1e-42, 1e30])
+def test_what_reflects_nothing_or_any_amount_gives_numbers(seen: Bowl, albedo: float) -> None:
+    of = seen.observed(seen.raised(0.8))
+    extreme = of._replace(vertices=replace(of.vertices, reflectance=torch.full_like(of.vertices.reflectance, albedo)))
+    told = told_by(shadow_borders(extreme, seen.pixel), of.surface, seen.pixel)
+    assert np.isfinite(told.offset).all() and not np.isnan(told.sigma).any()
+    assert albedo or np.isinf(told.sigma).all()
+
+
+def test_views_that_see_little_or_nothing_say_nothing(seen: Bowl) -> None:
+    of = seen.observed(seen.raised(0.8))
+    for count in (0, 3):
+        few = of.views[0].of_pairs(torch.arange(count))
+        assert np.isinf(told_by(shadow_borders(of._replace(views=[few] * 4), seen.pixel), of.surface, seen.pixel).sigma).all()

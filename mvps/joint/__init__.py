@@ -31,6 +31,7 @@ The model
 Positions
     agreement.py         where views agree that the surface is
     photoconsistency.py  where single photographs agree
+    borders.py           where borders of cast shadows say that it is deeper
     fused.py             the views' normals together, on vertices and faces
     sharpened.py         what pixels blurred of them
     vertices.py          positions from normals, agreement and masks

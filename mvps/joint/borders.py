@@ -127,8 +127,10 @@ def _shown(of: Observed, i: int) -> tuple[Float, Bool]:
     shaded = evaluate(of.vertices.normal[index], of.vertices.reflectance[index], samples.towards, lights, of.law, samples.gathered)
     sent, image, whole, cosine = (t.cpu().numpy() for t in (shaded.rest, samples.image, shaded.predicted, shaded.n_dot_l))
     low, high = HALF_LIT
-    clear = cosine > LEAST_COSINE
-    lit = np.clip(((image - sent) / np.where(clear, whole - sent, 1) - low) / (high - low), 0, 1)
+    clear = (cosine > LEAST_COSINE) & (whole > sent)
+    with np.errstate(over="ignore"):
+        # Of what reflects next to nothing any light is all of it.
+        lit = np.clip(((image - sent) / np.where(clear, whole - sent, 1) - low) / (high - low), 0, 1)
     return np.where(_saturated(of, i, index.cpu().numpy()), 1, lit), clear
 
 
