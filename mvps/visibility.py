@@ -151,6 +151,18 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
     return shadows(caster, caster.surface.vertices[vertices], caster.vertex_normals[vertices], lights)
 
 
+def distances_to_shade(caster: RayCaster, vertices: Int, lights: Float) -> Float:
+    """(n, lights) from vertices (n,), indices, towards lights (lights, 3) to the part of the mesh that hides them; inf where nothing does,
+    and for lights below the horizon."""
+    normal = caster.vertex_normals[vertices]
+    origins, above = caster.surface.vertices[vertices] + caster.offset * normal, normal @ lights.T > 0
+    distance = np.full(above.shape, np.inf)
+    for k, light in enumerate(lights):
+        rows = np.flatnonzero(above[:, k])
+        distance[rows, k] = caster.first_hits(origins[rows], np.broadcast_to(light, (len(rows), 3))).distance
+    return distance
+
+
 class Shade(NamedTuple):
     """Of n vertices and some lights, (n, lights) each: beside, whether a vertex or one near it is in cast shadow; deep, whether it is
     itself, and none near it is lit."""

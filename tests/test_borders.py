@@ -16,7 +16,7 @@ from mvps.joint.borders import RIM_PIXELS, Borders, shadow_borders, told_by
 from mvps.joint.grey import grey_lights
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.reflectance import Observed
-from mvps.mesh import vertex_normals
+from mvps.mesh import normalise, vertex_normals
 from mvps.rendering import photograph, points_under
 from mvps.scene import Capture, Law, Lights, Material, Surface, View
 from mvps.visibility import ray_caster
@@ -59,12 +59,14 @@ class Bowl:
         by = pixels * self.pixel * np.clip(4 * depth - 1, 0, 1)
         return Surface(self.surface.vertices + by[:, None] * vertex_normals(self.surface), self.surface.faces)
 
-    def observed(self, surface: Surface) -> Observed:
-        samples: list[ViewSamples] = observe(self.capture, surface, self.lights, CPU)
+    def observed(self, surface: Surface, lights: Lights | None = None) -> Observed:
+        """The bowl's photographs on a mesh; lights: what they are taken to be, the true ones if not given."""
+        lights = lights or self.lights
+        samples: list[ViewSamples] = observe(self.capture, surface, lights, CPU)
         count = len(surface.vertices)
         normal = torch.tensor(vertex_normals(surface), dtype=torch.float32)
         vertices = Vertices(normal, torch.full((count, 1), ALBEDO), torch.full((count,), 0.01))
-        return Observed(self.capture, surface, samples, vertices, grey_lights(self.lights, CPU), Law(()))
+        return Observed(self.capture, surface, samples, vertices, grey_lights(lights, CPU), Law(()))
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +121,22 @@ def test_what_is_saturated_is_no_shadow(seen: Bowl) -> None:
     assert told_at_the_bottom(seen, of._replace(capture=Capture("bowl", views), views=samples))[0] < 0.05
 
 
+def test_borders_move_with_the_lights_as_the_derivative_says(seen: Bowl) -> None:
+    """|J|^2 / 2 is the mean of (J . dl)^2 over turns dl of length one across the light: what f - S changes by, in four of them."""
+    angle, direction = 0.03, seen.lights.direction[0]
+    across = normalise(np.cross(direction, (0.3, 0.2, 0.9)))
+    other = np.cross(direction, across)
+    right = shadow_borders(seen.observed(seen.surface), seen.pixel)
+    predicted = np.average(right.turn, weights=right.weight) * angle**2
+    found = []
+    for turn in (across, -across, other, -other):
+        lights = Lights((normalise(direction + angle * turn),) * 4, seen.lights.intensity, False)
+        turned = shadow_borders(seen.observed(seen.surface, lights), seen.pixel)
+        found.append(np.average(turned.missing**2, weights=turned.weight))
+    without = np.average(right.missing**2, weights=right.weight)
+    assert without < 0.3 * predicted and 0.6 < (np.mean(found) - without) / predicted < 1.6
+
+
 def test_far_rims_are_believed_less(seen: Bowl) -> None:
     """A light that is off moves the shadow of a rim the farther, the farther that is."""
     pixel = seen.pixel
@@ -127,6 +145,7 @@ def test_far_rims_are_believed_less(seen: Bowl) -> None:
     assert RIM_PIXELS * pixel < near < 0.8 * far < np.inf
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("albedo", [0.0, 1e-42, 1e30])
 def test_what_reflects_nothing_or_any_amount_gives_numbers(seen: Bowl, albedo: float) -> None:
     of = seen.observed(seen.raised(0.8))

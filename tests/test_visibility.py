@@ -6,7 +6,7 @@ import trimesh
 
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Camera, Surface
-from mvps.visibility import RayCaster, cast_shadow, interpolate, shade_of, visible_vertices
+from mvps.visibility import RayCaster, cast_shadow, distances_to_shade, interpolate, shade_of, visible_vertices
 
 
 def sphere(radius: float = 1.0, centre: tuple[float, float, float] = (0, 0, 0)) -> Surface:
@@ -136,3 +136,17 @@ def test_open3d_sees_the_same() -> None:
     same = np.isfinite(theirs) == np.isfinite(ours)
     both = np.isfinite(theirs) & np.isfinite(ours)
     assert same.mean() > 0.9995 and np.abs(theirs[both] - ours[both]).max() < 1e-3
+
+
+def test_distances_to_what_hides_a_light() -> None:
+    """Under a ball that floats over another, from the lower one's top: where the ray enters the upper one, and nothing elsewhere."""
+    low, high = sphere(), sphere(0.5, (0, 0, 3))
+    both = Surface(np.concatenate([low.vertices, high.vertices]), np.concatenate([low.faces, high.faces + len(low.vertices)]))
+    lights = normalise(np.array([[0, 0, 1.0], [0.05, 0, 1.0], [1.0, 0, 1.0], [0, 0, -1.0]]))
+    caster, top = RayCaster(both), np.array([int(low.vertices[:, 2].argmax())])
+    found = distances_to_shade(caster, top, lights)[0]
+    start = both.vertices[top[0]] + caster.offset * caster.vertex_normals[top[0]]
+    along = lights[:2] @ ((0, 0, 3) - start)
+    entered = along - np.sqrt(0.25 - (((0, 0, 3) - start) ** 2).sum() + along**2)
+    assert np.allclose(found[:2], entered, atol=5e-3) and np.isinf(found[2:]).all()
+    assert np.array_equal(np.isfinite(found), cast_shadow(caster, top, lights)[0])

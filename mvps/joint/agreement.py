@@ -62,6 +62,11 @@ class Agreement:
         safe = np.where(weight > 0, weight, 1)
         return Agreement(pull / safe, np.where(weight > 0, 1 / np.sqrt(safe), np.inf))
 
+    @staticmethod
+    def unknown(count: int) -> Agreement:
+        """Of `count` vertices about which nothing is known."""
+        return Agreement(np.zeros(count), np.full(count, np.inf))
+
     def joined(self, other: Agreement, floor: float) -> Agreement:
         """Both together; floor: the smallest standard deviation of either."""
         own, others = self.weight(floor), other.weight(floor)

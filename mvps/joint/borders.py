@@ -19,9 +19,10 @@ that of vertices raised by h. Vertices in a window of AROUND edges move alike,
 
 s the scatter of f - S. The nearer what casts a shadow, the less lights' errors move its border: hollows, which see their own rims, are told
 best. Only t < -(sigma_t + RIM_PIXELS) is believed, as far as it is beyond that: what looks lighter than shadow may have light from
-elsewhere, what looks darker than light lies deeper; and the mesh rounds rims, so that their shadows are a little too short. Neither albedo
-nor what normals say takes part, nor what walls send each other: in a hollow that is too shallow shadows are too short whatever it looks
-like. (Shape from shadows: Shafer and Kanade 1983, Savarese et al. 2007. Here they mend a surface that is nearly right.)
+elsewhere, what looks darker than light lies deeper; and the mesh rounds rims, so that their shadows are a little too short. Albedo, normals
+and what walls send each other say how bright a place in the light would be, no more: wrong by a quarter, they move no border (HALF_LIT).
+In a hollow that is too shallow shadows are too short, whatever they are. (Shape from shadows: Shafer and Kanade 1983, Savarese et al. 2007.
+Here they mend a surface that is nearly right.)
 """
 
 from __future__ import annotations
@@ -32,43 +33,44 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 
-from mvps.camera import bilinear, project
 from mvps.cores import on_cores
 from mvps.joint.agreement import Agreement
 from mvps.joint.blocks import evaluate
+from mvps.joint.observe import saturated
 from mvps.joint.reflectance import Observed
 from mvps.joint.vertices import SHARED
 from mvps.mesh import face_areas
 from mvps.scene import Bool, Float, Int, Surface
-from mvps.visibility import RayCaster, ray_caster
+from mvps.visibility import RayCaster, distances_to_shade, ray_caster
 
 RINGS = 2
 """Edges around a vertex over which f and S are means: as far as the mesh knows a border (SHADOW_MARGIN in observe.py)."""
 
 AROUND = 4
-"""Edges of a window whose vertices move alike: RINGS on either side of a border."""
+"""Edges of a window whose vertices move alike: RINGS on either side of a border. Other numbers were not tried in whole runs."""
 
 HALF_LIT = 0.25, 0.75
 """Shares of the light from which a sample is in it at all, and wholly: a quarter is what albedo, lobes and light from other surfaces may
 be off by."""
 
 LEAST_COSINE = 0.15
-"""Of a light over the surface (81 degrees): lower ones tell of the mesh's facets, not of what is in their way."""
+"""Of the angle between light and normal, 81 degrees: p grows with its tangent, and a normal that is off by some degrees, the mesh's or a
+facet's, changes it by half there. Other numbers were not tried."""
 
 SEEN = 0.5
 """Part of the vertices around that must be seen, and lit from above the horizon."""
 
 LEAST_SLOPE = 0.01
-"""Of p, per pixel: a border within RINGS edges changes the share by 0.1 to 0.5 a pixel."""
+"""Of p, per pixel: a tenth of what the means around a border have (0.1 to 0.5). What is below takes no part: it is far from any."""
 
 LIGHT_SIGMA = 0.01
 """Standard deviation of lights, radians: they are known to some tenths of a degree (SHARED_SIGMA in fused.py)."""
 
 RIM_PIXELS = 0.1
-"""Standard deviation, and bound, of the place of what casts shadows, whose edges the mesh rounds by a tenth of a pixel
-(docs/findings/edges.md)."""
+"""Standard deviation, and bound, of the place of what casts shadows, whose edges the mesh rounds by about as much; 0, 0.1 and 0.2 were
+tried (docs/findings/shadows.md)."""
 
-LEAST_KNOWN_PIXELS, FARTHEST_PIXELS = 2.0, 3.0
+LARGEST_SIGMA_PIXELS, FARTHEST_PIXELS = 2.0, 3.0
 """Standard deviation and displacement beyond which borders say nothing: RINGS edges of a last mesh, and the most that means over RINGS
 edges of a first one follow."""
 
@@ -101,26 +103,6 @@ def _rows_of_one(matrix: sp.csr_matrix) -> sp.csr_matrix:
     return scaled
 
 
-def _distances(caster: RayCaster, vertices: Int, above: Bool, lights: Float) -> Float:
-    """(n, lights) from vertices, where above (n, lights), towards lights to what is in their way, inf where nothing is."""
-    origins = caster.surface.vertices[vertices] + caster.offset * caster.vertex_normals[vertices]
-    distance = np.full(above.shape, np.inf)
-    for k, light in enumerate(lights):
-        rows = np.flatnonzero(above[:, k])
-        distance[rows, k] = caster.first_hits(origins[rows], np.broadcast_to(light, (len(rows), 3))).distance
-    return distance
-
-
-def _saturated(of: Observed, i: int, vertices: Int) -> Bool:
-    """(n, lights) whether a photograph of view i says only that a vertex is no darker than so: in the light, then."""
-    view = of.capture.views[i]
-    usable = view.usable()
-    if usable.all():
-        return np.zeros((len(vertices), usable.shape[1]), np.bool_)
-    positions, weights = bilinear(view.pixel_index, project(view.camera, of.surface.vertices[vertices])[0])
-    return np.asarray((~usable[positions] & (weights > 0)[..., None]).any(1))
-
-
 def _shown(of: Observed, i: int) -> tuple[Float, Bool]:
     """(n, lights) which share of a light view i shows to reach the vertices that it sees, and where it shows that at all."""
     samples, index, lights = of.views[i], of.views[i].vertex, of.lights[i]
@@ -131,7 +113,8 @@ def _shown(of: Observed, i: int) -> tuple[Float, Bool]:
     with np.errstate(over="ignore"):
         # Of what reflects next to nothing any light is all of it.
         lit = np.clip(((image - sent) / np.where(clear, whole - sent, 1) - low) / (high - low), 0, 1)
-    return np.where(_saturated(of, i, index.cpu().numpy()), 1, lit), clear
+    points = of.surface.vertices[index.cpu().numpy()]
+    return np.where(saturated(of.capture.views[i], points), 1, lit), clear
 
 
 def _of_view(of: Observed, i: int, caster: RayCaster, gradient: list[sp.csr_matrix], pixel: float) -> Borders:
@@ -140,7 +123,7 @@ def _of_view(of: Observed, i: int, caster: RayCaster, gradient: list[sp.csr_matr
     n_dot_l = normal @ direction.T
     lit, clear = _shown(of, i)
     clear = clear & (n_dot_l > LEAST_COSINE)
-    distance = _distances(caster, rows, n_dot_l > 0, direction.astype(np.float64))
+    distance = distances_to_shade(caster, rows, direction.astype(np.float64))
     hidden = np.isfinite(distance)
 
     around = caster.around[rows][:, rows]
@@ -176,7 +159,7 @@ def told_by(borders: Borders, surface: Surface, pixel: float) -> Agreement:
     """By how much the surface's vertices are to move inwards, along their normals, for shadows to end where photographs show them to."""
     count, tiny = len(surface.vertices), np.finfo(np.float64).tiny
     if not len(borders.vertex):
-        return Agreement.of_weights(np.zeros(count), np.zeros(count))
+        return Agreement.unknown(count)
     scatter = np.median(np.abs(borders.missing)) / 0.6745
     weight = borders.weight / (scatter**2 / SHARED + borders.turn * LIGHT_SIGMA**2 + tiny)
     mean = _rows_of_one(ray_caster(surface).around)
@@ -191,5 +174,5 @@ def told_by(borders: Borders, surface: Surface, pixel: float) -> Agreement:
     offset = of_windows(weight * borders.slope * borders.missing) / np.maximum(total, tiny)
     rim = RIM_PIXELS * pixel
     sigma = np.sqrt(1 / np.maximum(total, tiny) + rim**2)
-    known = (offset < -(sigma + rim)) & (sigma < LEAST_KNOWN_PIXELS * pixel) & (-offset < FARTHEST_PIXELS * pixel)
+    known = (offset < -(sigma + rim)) & (sigma < LARGEST_SIGMA_PIXELS * pixel) & (-offset < FARTHEST_PIXELS * pixel)
     return Agreement(np.where(known, offset + sigma + rim, 0), np.where(known, sigma, np.inf))

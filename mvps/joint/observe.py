@@ -125,11 +125,28 @@ def _sampled(
     image: NDArray[np.float32], usable: NDArray[np.bool_], positions: Int, weights: Float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Grey radiance (n, lights) at bilinear positions, weights (n, 4) of the foreground list, and whether all four are usable."""
-    corners = sp.csr_matrix(
-        (weights.astype(np.float32).ravel(), positions.ravel(), np.arange(0, positions.size + 1, 4)), (len(positions), len(image))
-    )
-    lost = (corners @ (~usable).astype(np.float32)) > 0 if not usable.all() else np.zeros((len(positions), image.shape[1]), bool)
-    return corners @ image, ~lost
+    corners = _corners(positions, weights, len(image))
+    return corners @ image, ~_lost(usable, corners)
+
+
+def _corners(positions: Int, weights: Float, pixels: int) -> sp.csr_matrix:
+    """(n, pixels) from values of pixels to those at bilinear positions, weights (n, 4)."""
+    ends = np.arange(0, positions.size + 1, 4)
+    return sp.csr_matrix((weights.astype(np.float32).ravel(), positions.ravel(), ends), (len(positions), pixels))
+
+
+def _lost(usable: NDArray[np.bool_], corners: sp.csr_matrix) -> NDArray[np.bool_]:
+    """(n, lights) whether one of the pixels that corners (n, pixels) take part in is not usable (pixels, lights)."""
+    if usable.all():
+        return np.zeros((corners.shape[0], usable.shape[1]), bool)
+    return np.asarray((corners @ (~usable).astype(np.float32)) > 0)
+
+
+def saturated(view: View, points: Float) -> NDArray[np.bool_]:
+    """(n, lights) whether a view's photographs say only that points (n, 3) of the object are no darker than so."""
+    positions, weights = bilinear(view.pixel_index, project(view.camera, points)[0])
+    usable = view.usable()
+    return _lost(usable, _corners(positions, weights, len(usable)))
 
 
 def _pairs(view: View, caster: RayCaster, among: Bool | None = None) -> tuple[Int, Float, Int, Float]:

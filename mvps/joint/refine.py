@@ -132,6 +132,12 @@ def _observed(state: State) -> tuple[Observed, Lights]:
     return Observed(photographs, state.surface, state.views, state.vertices, grey, state.law), lights
 
 
+def _back(start: Float, surface: Surface) -> Float:
+    """By how much (V,) the surface's vertices would move along their normals back to where they were, start (V, 3)."""
+    back: Float = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
+    return back
+
+
 def _agreement_of(state: State, capture: Capture, seen: list[Any], settings: RoundSettings, pixel: float) -> Callable[[Surface], Agreement]:
     """Where views agree that vertices lie, of the round's surface wherever it has moved since."""
     offsets, start, normals = settings.offsets() * pixel, state.surface.vertices, state.maps
@@ -141,7 +147,7 @@ def _agreement_of(state: State, capture: Capture, seen: list[Any], settings: Rou
     photographs = [] if state.vertices is None else shown_in(*_observed(state))
 
     def agreed(surface: Surface) -> Agreement:
-        back = ((start - surface.vertices) * vertex_normals(surface)).sum(1)
+        back = _back(start, surface)
         held = Agreement(back, np.full(len(back), pixel))
         return held.joined(photoconsistency(photographs, surface, offsets), POSITION_FLOOR_PIXELS * pixel) if photographs else held
 
@@ -151,14 +157,10 @@ def _agreement_of(state: State, capture: Capture, seen: list[Any], settings: Rou
 def _told_by_shadows(state: State, pixel: float) -> Callable[[Surface], Agreement]:
     """Where borders of cast shadows say that vertices lie, of the round's surface wherever it has moved since."""
     start = state.surface.vertices
-    told = Agreement.of_weights(*np.zeros((2, len(start))))
+    told = Agreement.unknown(len(start))
     if state.vertices is not None and state.law.shadows:
         told = told_by(shadow_borders(_observed(state)[0], pixel), state.surface, pixel)
-
-    def of(surface: Surface) -> Agreement:
-        return replace(told, offset=told.offset + ((start - surface.vertices) * vertex_normals(surface)).sum(1))
-
-    return of
+    return lambda surface: replace(told, offset=told.offset + _back(start, surface))
 
 
 def _moved(
