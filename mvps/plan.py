@@ -13,9 +13,9 @@ from mvps.joint.refine import RefineSettings, RoundSettings
 from mvps.material import LARGEST, Model
 from mvps.scene import Law
 
-STILL_PIXELS = 0.1
-"""Mean move of the vertices in a coarse round above which it is done again: bunny's move by 0.36 and 0.09, in five views by 0.46, 0.29
-and 0.11, and what is left in the end is half or two thirds of what it is after one round (docs/findings/stage_one.md)."""
+STILL_PIXELS = 0.05
+"""Mean move of the vertices that is still to come after a round, above which it is done again: less is within the least error of
+where views agree (POSITION_FLOOR_PIXELS in mvps/joint/refine.py)."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +80,15 @@ def once(plan: RefineSettings) -> RefineSettings:
     return replace(plan, rounds=tuple(replace(one, still=np.inf) for one in plan.rounds))
 
 
-def last_pass(preset: str, free_lights: bool, far: bool) -> RefineSettings:
+def last_pass(preset: str, free_lights: bool, far: bool, before: list[dict[str, float]]) -> RefineSettings:
     """Rounds after Stage I; sweeps reach as far as Stage I may be off. far: photographs have farther to pull the surface, because Stage I
-    saw them at half their size, or had nothing but vertices' normals to go by, of views with fewer lights than tell a normal."""
-    first = RoundSettings(2.0, 1.2, 0.3, crease=0.1)
+    saw them at half their size, or had nothing but vertices' normals to go by, of views with fewer lights than tell a normal. before: what
+    the rounds before came to."""
+    first = RoundSettings(2.0, 1.2, 0.3, crease=0.1, still=STILL_PIXELS)
     rounds: tuple[RoundSettings, ...] = {
         "standard": (first, replace(first, for_detail=True)),
         "fine": (first, replace(first, edge=1.0)),
     }[preset]
     if far:
         rounds = (COARSE, *rounds)
-    return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True)
+    return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True, goes_on=before[-1]["goes_on"])

@@ -142,7 +142,7 @@ def reconstruct(
         free = lights is None and start.rounds[-1]["residual"] <= POOR_FIT
         far = few_lights(used) or halvings(used) > 0
         start = replace(start, maps=()) if halvings(used) else start
-        plan, name = parts.of(last_pass(settings.preset, free, far)), "joint refinement"
+        plan, name = parts.of(last_pass(settings.preset, free, far, rounds)), "joint refinement"
         refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
         if lights is None and not free and start.status != "converged":
             # Lights that stay where they still turned have not settled.

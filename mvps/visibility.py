@@ -151,22 +151,23 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
     return shadows(caster, caster.surface.vertices[vertices], caster.vertex_normals[vertices], lights)
 
 
-def distances_to_shade(caster: RayCaster, vertices: Int, lights: Float) -> Float:
-    """(n, lights) from vertices (n,), indices, towards lights (lights, 3) to the part of the mesh that hides them; inf where nothing does,
-    and for lights below the horizon."""
-    normal = caster.vertex_normals[vertices]
-    origins, above = caster.surface.vertices[vertices] + caster.offset * normal, normal @ lights.T > 0
-    distance = np.full(above.shape, np.inf)
-    for k, light in enumerate(lights):
-        rows = np.flatnonzero(above[:, k])
-        distance[rows, k] = caster.first_hits(origins[rows], np.broadcast_to(light, (len(rows), 3))).distance
+def distances_to_shade(caster: RayCaster, vertices: Int, lights: Float, hidden: Bool) -> Float:
+    """(n, lights) from vertices (n,), indices, towards lights (lights, 3) to the part of the mesh that hides them, where hidden (n, lights)
+    says that one does; 0 elsewhere."""
+    distance = np.zeros(hidden.shape)
+    row, light = np.nonzero(hidden)
+    at = vertices[row]
+    found = caster.first_hits(caster.surface.vertices[at] + caster.offset * caster.vertex_normals[at], lights[light]).distance
+    # What grazes an edge may be found by one kind of ray and not by the other.
+    distance[row, light] = np.where(np.isfinite(found), found, 0)
     return distance
 
 
 class Shade(NamedTuple):
-    """Of n vertices and some lights, (n, lights) each: beside, whether a vertex or one near it is in cast shadow; deep, whether it is
-    itself, and none near it is lit."""
+    """Of n vertices and some lights, (n, lights) each: hidden, whether a vertex is in cast shadow; beside, whether it or one near it is;
+    deep, whether it is itself, and none near it is lit."""
 
+    hidden: Bool
     beside: Bool
     deep: Bool
 
@@ -186,7 +187,7 @@ def shade_of(caster: RayCaster, vertices: Int, lights: Float, margin: int) -> Sh
         dark = shadow[:, part]
         beside[:, part] = around @ dark.astype(np.float32) > 0
         deep[:, part] = dark[own] & ~(around @ (facing[:, part] & ~dark).astype(np.float32) > 0)
-    return Shade(beside, deep)
+    return Shade(shadow[own], beside, deep)
 
 
 def shadows(caster: RayCaster, points: Float, normal: Float, lights: Float) -> Bool:

@@ -249,7 +249,7 @@ def test_light_between_metals_is_found_and_normals_are_better_with_it() -> None:
     errors = []
     for model in (LARGEST, replace(LARGEST, gleam=False)):
         parts = Parts(model, moves=False)
-        plan = parts.of(last_pass("standard", True, False))
+        plan = parts.of(last_pass("standard", True, False, [{"goes_on": 0.0}]))
         assert truth.surface is not None
         refined = refine(capture, truth.surface, lights, maps, parts.law(), plan, 0, torch.device("cpu"), lambda *_: None)
         errors.append(np.mean([angles_deg(true, found.normal).mean() for true, found in zip(normals, refined.maps, strict=True)]))

@@ -46,17 +46,25 @@ def test_lights_that_stay_are_those_of_the_factorisation(capture: Capture) -> No
     assert np.abs(fixed.lights.direction[0] - free.lights.direction[0]).max() > 1e-3
 
 
+BEFORE = [{"goes_on": 0.3}]
+
+
 def test_parts_change_nothing_else() -> None:
-    for plan in (first_pass(True, False), first_pass(False, True), last_pass("standard", True, False), last_pass("fine", False, True)):
+    for plan in (
+        first_pass(True, False),
+        first_pass(False, True),
+        last_pass("standard", True, False, BEFORE),
+        last_pass("fine", False, True, BEFORE),
+    ):
         assert Parts().of(plan) == plan
-    plan = last_pass("standard", True, False)
+    plan = last_pass("standard", True, False, BEFORE)
     coarse = Parts(edges=2.0).of(plan)
     assert [one.edge for one in coarse.rounds] == [2 * one.edge for one in plan.rounds] and coarse.model == LARGEST
 
 
 def test_a_surface_that_is_far_off_is_pulled_by_photographs_first() -> None:
     for preset in ("standard", "fine"):
-        near, far = (last_pass(preset, True, far).rounds for far in (False, True))
+        near, far = (last_pass(preset, True, far, BEFORE).rounds for far in (False, True))
         assert far[1:] == near and far[0].carving and far[0].reach > near[0].reach and np.isfinite(far[0].still)
 
 

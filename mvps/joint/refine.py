@@ -27,6 +27,7 @@ from mvps.joint.grey import grey_lights
 from mvps.joint.lighting import drawn
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
+from mvps.joint.onward import MOST_GOES_ON, Moves, carried_on
 from mvps.joint.photoconsistency import photoconsistency, shown_in
 from mvps.joint.photometry import WEAK_TIE, Task, photometric_round
 from mvps.joint.pixels import few_lights
@@ -58,7 +59,7 @@ MOSTLY = 0.6
 Four captures lie at 0.38 to 0.46 and 0.69 to 0.74 (docs/findings/vertices.md)."""
 
 
-MOST_REPEATS = 2
+MOST_REPEATS = 3
 """How often a round is done again whose vertices moved by more than its sweeps reach: what they look for may lie beyond."""
 
 
@@ -68,8 +69,9 @@ class RoundSettings:
     and vertices' normals and reflectance, or only fuse the views' normals; crease: radians that the normal may turn along an edge before it
     is split; for_detail: left out where the mesh of the round before had enough edges (MOSTLY); fusions: faces turn and move, so that
     other pixels speak for them, and from where a fusion put the surface views agree deeper in hollows; without any the surface stays.
-    still: pixels that vertices may move in the mean before the round is done again, where the model fits. carving: single photographs
-    say where vertices lie, not the pixels' normals, which in a hollow that is too shallow agree where the surface already is."""
+    still: pixels that vertices may have to go on in the mean before the round is done again, where the model fits. carving: single
+    photographs say where vertices lie, not the pixels' normals, which in a hollow that is too shallow agree where the surface already
+    is."""
 
     edge: float
     reach: float
@@ -92,8 +94,8 @@ class RefineSettings:
     held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
     last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
     the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels and more, or for
-    Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last round's (detail.py); model: all
-    that the reflectance may have."""
+    Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last round's (detail.py); goes_on:
+    how far earlier rounds' moves did (onward.py); model: all that the reflectance may have."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
@@ -102,6 +104,7 @@ class RefineSettings:
     for_field: bool = False
     half: bool = False
     detail: bool = False
+    goes_on: float = MOST_GOES_ON
     model: Model = LARGEST
 
 
@@ -196,6 +199,13 @@ def _remeshed(
     return split_edges(surface, creased), float(creased.mean())
 
 
+def _in_detail(result: Refined, capture: Capture, told: Moved, seen: list[Any]) -> Refined:
+    """The result on a mesh that is finer than its last round's."""
+    finer = detailed(capture, told, result.maps, seen)
+    material, unexplained = interpolated(result.material, finer), finer.share @ result.unexplained
+    return replace(result, surface=finer.surface, material=material, unexplained=unexplained)
+
+
 def refine(
     capture: Capture,
     surface: Surface,
@@ -220,10 +230,12 @@ def refine(
     state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), together=together)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
+    last: Moves | float = settings.goes_on
     repeats = 0
     while pending:
         round_settings = pending.pop(0)
-        state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
+        if not isinstance(last, Moves):
+            state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
         room_for(len(state.surface.vertices), lights=state.together)
         if np.isfinite(round_settings.crease) and creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
@@ -240,16 +252,18 @@ def refine(
         if not leaves_surface:
             told = _moved(state.surface, mesh_normal, state, capture, seen, round_settings, pixel)
             moved = told.surface
+        by_any = np.isin(np.arange(len(moved.vertices)), np.concatenate(seen))
+        moved, moves = carried_on(state.surface, moved, by_any, last)
+        changes["goes_on"] = moves.goes_on
         shift = np.linalg.norm(moved.vertices - state.surface.vertices, axis=1)
         changes["vertex_change_px"] = float(shift.mean() / pixel)
         far = changes["vertex_change_px"] > round_settings.reach
         # Where the model does not fit, single photographs pull vertices elsewhere.
-        moving = changes["vertex_change_px"] > round_settings.still and changes.get("residual", np.inf) <= POOR_FIT
+        moving = moves.left > round_settings.still * pixel and changes.get("residual", np.inf) <= POOR_FIT
         again = (far or moving) and repeats < MOST_REPEATS
-        if again:
-            pending.insert(0, round_settings)
-            repeats += 1
+        pending, repeats = ([round_settings, *pending], repeats + 1) if again else (pending, repeats)
         state.surface = moved
+        last = moves if again and not far else moves.goes_on
         if state.vertices is not None:
             carried = (moved, state.vertices)
         # What has moved so far is meshed anew.
@@ -258,9 +272,7 @@ def refine(
         on_round(len(account), account[-1])
     result = replace(finished(state, settings, account, generator), carried=carried)
     if told is not None and settings.detail:
-        finer = detailed(capture, told, state.maps, seen)
-        material, unexplained = interpolated(result.material, finer), finer.share @ result.unexplained
-        result = replace(result, surface=finer.surface, material=material, unexplained=unexplained)
+        result = _in_detail(result, capture, told, seen)
     return replace(result, material=shaded_as(result.material, result.surface)) if settings.final else result
 
 
