@@ -25,7 +25,7 @@ AROUND = 6
 """Edges of a window, of about a hundred vertices: moves by chance share their errors with a dozen neighbours."""
 
 MOST_GOES_ON = 0.5
-"""Most of q, and q where only one round has spoken: hollows have 0.2 to 0.5, and moves are doubled at most (docs/findings/vertices.md)."""
+"""Most of q, and q where only one round has spoken: hollows have 0.2 to 0.5, and moves are doubled at most (docs/findings/stage_one.md)."""
 
 
 class Moves(NamedTuple):

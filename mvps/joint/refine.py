@@ -60,7 +60,8 @@ Four captures lie at 0.38 to 0.46 and 0.69 to 0.74 (docs/findings/vertices.md)."
 
 
 MOST_REPEATS = 3
-"""How often a round is done again whose vertices moved by more than its sweeps reach: what they look for may lie beyond."""
+"""How often rounds are done again, in all, whose vertices moved by more than their sweeps reach, for what they look for may lie beyond, or
+have farther to go: hollows of three captures had arrived after two to four (docs/findings/stage_one.md)."""
 
 
 @dataclass(frozen=True)
