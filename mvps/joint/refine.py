@@ -59,9 +59,12 @@ MOSTLY = 0.6
 Four captures lie at 0.38 to 0.46 and 0.69 to 0.74 (docs/findings/vertices.md)."""
 
 
-MOST_REPEATS = 3
-"""How often rounds are done again, in all, whose vertices moved by more than their sweeps reach, for what they look for may lie beyond, or
-have farther to go: hollows of three captures had arrived after two to four (docs/findings/stage_one.md)."""
+MOST_REPEATS = 2
+"""How often a round is done again whose vertices moved by more than its sweeps reach: what they look for may lie beyond."""
+
+MOST_ONWARD = 1
+"""The same where vertices have farther to go: a second round takes them there, and after more of them photographs over hollows that only
+digging reaches fit well enough for these not to be found (docs/findings/stage_one.md)."""
 
 
 @dataclass(frozen=True)
@@ -261,8 +264,8 @@ def refine(
         far = changes["vertex_change_px"] > round_settings.reach
         # Where the model does not fit, single photographs pull vertices elsewhere.
         moving = moves.left > round_settings.still * pixel and changes.get("residual", np.inf) <= POOR_FIT
-        again = (far or moving) and repeats < MOST_REPEATS
-        pending, repeats = ([round_settings, *pending], repeats + 1) if again else (pending, repeats)
+        again = (far and repeats < MOST_REPEATS) or (moving and repeats < MOST_ONWARD)
+        pending, repeats = ([round_settings, *pending], repeats + 1) if again else (pending, 0)
         state.surface = moved
         last = moves if again and not far else moves.goes_on
         if state.vertices is not None:
