@@ -184,7 +184,7 @@ def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
-    out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9")
+    out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9", preset="draft")
     found = figures(out, capture)
     # A view from 45 degrees aside, of an object with patches whose edges one pixel of error moves: 26 dB and 32 dB measured.
     assert found["held_out_views_psnr_db"] > 23 and found["held_out_lights_psnr_db"] > 28
@@ -193,7 +193,7 @@ def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> No
 
 
 def test_given_lights_are_taken_as_they_are(capture: Path, tmp_path: Path) -> None:
-    out = reconstructed(capture, tmp_path / "given", "--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8")
+    out = reconstructed(capture, tmp_path / "given", "--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8", preset="draft")
     read = read_reconstruction(out)
     assert read.views == tuple(f"view_{k:02d}" for k in (1, 2, 3, 5, 6, 7)) and read.light_names[0] == (1, 2, 4, 5, 7, 8)
     found = figures(out, capture)
