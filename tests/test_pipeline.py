@@ -193,7 +193,8 @@ def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> No
 
 
 def test_given_lights_are_taken_as_they_are(capture: Path, tmp_path: Path) -> None:
-    out = reconstructed(capture, tmp_path / "given", "--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8", preset="draft")
+    options = ("--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8")
+    out = reconstructed(capture, tmp_path / "given", *options, preset="draft")
     read = read_reconstruction(out)
     assert read.views == tuple(f"view_{k:02d}" for k in (1, 2, 3, 5, 6, 7)) and read.light_names[0] == (1, 2, 4, 5, 7, 8)
     found = figures(out, capture)
