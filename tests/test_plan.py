@@ -65,6 +65,7 @@ def test_parts_change_nothing_else() -> None:
 def test_a_surface_that_is_far_off_is_pulled_by_photographs_first() -> None:
     for preset in ("standard", "fine"):
         near, far = (last_pass(preset, True, far, BEFORE).rounds for far in (False, True))
+        assert last_pass(preset, True, False, BEFORE).goes_on == BEFORE[-1]["goes_on"]
         assert far[1:] == near and far[0].carving and far[0].reach > near[0].reach and np.isfinite(far[0].still)
 
 

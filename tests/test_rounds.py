@@ -9,7 +9,7 @@ from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.camera import pixel_footprint
 from mvps.joint import refine as rounds
-from mvps.joint.refine import MOST_REPEATS, RefineSettings, RoundSettings, refine
+from mvps.joint.refine import MOST_REPEATS, Refined, RefineSettings, RoundSettings, refine
 from mvps.photometric import normal_maps
 from mvps.scene import Law, Surface
 
@@ -21,17 +21,25 @@ def scene() -> SphereScene:
     return make_sphere(3)
 
 
-def swollen(scene: SphereScene, pixels: float, still: float = np.inf, fusions: int = 3) -> tuple[list[float], float]:
-    """From a surface that many pixels too large: the vertices' mean change in every round, and the error of the radius, in pixels."""
+def refined_from(scene: SphereScene, pixels: float, plan: RefineSettings) -> Refined:
+    """From a surface that many pixels too large."""
     surface, device = scene.reconstruction.surface, torch.device("cpu")
     lights = scene.reconstruction.lights
-    pixel = pixel_footprint([view.camera for view in scene.capture.views], np.zeros(3))
-    start = Surface(surface.vertices * (1 + pixels * pixel / RADIUS), surface.faces)
+    start = Surface(surface.vertices * (1 + pixels * pixel_of(scene) / RADIUS), surface.faces)
     maps = normal_maps(scene.capture, lights, device)
-    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=still, fusions=fusions),), free_lights=False)
-    refined = refine(scene.capture, start, lights, maps, Law((8.0,)), plan, 0, device, lambda *_: None)
+    return refine(scene.capture, start, lights, maps, Law((8.0,)), plan, 0, device, lambda *_: None)
+
+
+def pixel_of(scene: SphereScene) -> float:
+    return pixel_footprint([view.camera for view in scene.capture.views], np.zeros(3))
+
+
+def swollen(scene: SphereScene, pixels: float, still: float = np.inf, fusions: int = 3, goes_on: float = 0.5) -> tuple[list[float], float]:
+    """The vertices' mean change in every round, and the error of the radius, in pixels."""
+    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=still, fusions=fusions),), free_lights=False, goes_on=goes_on)
+    refined = refined_from(scene, pixels, plan)
     radius = np.linalg.norm(refined.surface.vertices, axis=1)
-    return [one["vertex_change_px"] for one in refined.rounds], float(np.abs(radius - RADIUS).mean() / pixel)
+    return [one["vertex_change_px"] for one in refined.rounds], float(np.abs(radius - RADIUS).mean() / pixel_of(scene))
 
 
 def test_a_round_is_done_again_where_vertices_moved_far(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,6 +60,18 @@ def test_a_round_is_done_again_until_vertices_are_still(scene: SphereScene) -> N
     changes, _ = swollen(scene, 0.5, still=0.6 * first)
     assert changes[0] == first and len(changes) == 2 and changes[1] <= 0.6 * first
     assert len(swollen(scene, 0.5, still=1.5 * first)[0]) == 1
+
+
+def test_where_earlier_moves_did_not_go_on_a_round_stays_single(scene: SphereScene) -> None:
+    (first,), _ = swollen(scene, 0.5)
+    assert swollen(scene, 0.5, still=0.01 * first, goes_on=0.0)[0] == [first]
+
+
+def test_a_round_that_goes_on_keeps_its_mesh(scene: SphereScene) -> None:
+    """Its edges are not split once more, for moves are compared vertex by vertex."""
+    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=0.01, crease=0.02),), free_lights=False)
+    first, second = refined_from(scene, 0.5, plan).rounds
+    assert first["vertices"] == second["vertices"] and first["goes_on"] == 0.5 > second["goes_on"]
 
 
 def test_of_a_model_that_does_not_fit_no_round_is_done_again(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
