@@ -151,23 +151,24 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
     return shadows(caster, caster.surface.vertices[vertices], caster.vertex_normals[vertices], lights)
 
 
-def distances_to_shade(caster: RayCaster, vertices: Int, lights: Float, hidden: Bool) -> Float:
-    """(n, lights) from vertices (n,), indices, towards lights (lights, 3) to the part of the mesh that hides them, where hidden (n, lights)
-    says that one does; 0 elsewhere."""
-    distance = np.zeros(hidden.shape)
+def distances_to_shade(caster: RayCaster, vertices: Int, lights: Float) -> Float:
+    """(n, lights) from vertices (n,), indices, towards lights (lights, 3) to the part of the mesh that hides them; inf where nothing does,
+    and for lights below the horizon."""
+    # Whether anything hides a light takes less to find than what is first, and of few anything does.
+    hidden = cast_shadow(caster, vertices, lights)
     row, light = np.nonzero(hidden)
     at = vertices[row]
-    found = caster.first_hits(caster.surface.vertices[at] + caster.offset * caster.vertex_normals[at], lights[light]).distance
-    # What grazes an edge may be found by one kind of ray and not by the other.
-    distance[row, light] = np.where(np.isfinite(found), found, 0)
+    distance = np.full(hidden.shape, np.inf)
+    distance[row, light] = caster.first_hits(
+        caster.surface.vertices[at] + caster.offset * caster.vertex_normals[at], lights[light]
+    ).distance
     return distance
 
 
 class Shade(NamedTuple):
-    """Of n vertices and some lights, (n, lights) each: hidden, whether a vertex is in cast shadow; beside, whether it or one near it is;
-    deep, whether it is itself, and none near it is lit."""
+    """Of n vertices and some lights, (n, lights) each: beside, whether a vertex or one near it is in cast shadow; deep, whether it is
+    itself, and none near it is lit."""
 
-    hidden: Bool
     beside: Bool
     deep: Bool
 
@@ -187,7 +188,7 @@ def shade_of(caster: RayCaster, vertices: Int, lights: Float, margin: int) -> Sh
         dark = shadow[:, part]
         beside[:, part] = around @ dark.astype(np.float32) > 0
         deep[:, part] = dark[own] & ~(around @ (facing[:, part] & ~dark).astype(np.float32) > 0)
-    return Shade(shadow[own], beside, deep)
+    return Shade(beside, deep)
 
 
 def shadows(caster: RayCaster, points: Float, normal: Float, lights: Float) -> Bool:

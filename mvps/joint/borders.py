@@ -123,14 +123,12 @@ def _of_view(of: Observed, i: int, caster: RayCaster, gradient: list[sp.csr_matr
     n_dot_l = normal @ direction.T
     lit, clear = _shown(of, i)
     clear = clear & (n_dot_l > LEAST_COSINE)
-    in_shadow = of.views[i].hidden
-    assert in_shadow is not None
-    hidden = in_shadow.cpu().numpy()
-    distance = distances_to_shade(caster, rows, direction.astype(np.float64), hidden)
+    distance = distances_to_shade(caster, rows, direction.astype(np.float64))
+    hidden = np.isfinite(distance)
 
     around = caster.around[rows][:, rows]
     mean = _rows_of_one(around)
-    means = np.hstack([lit * clear, ~hidden * clear, clear, distance, hidden]).astype(np.float32)
+    means = np.hstack([lit * clear, ~hidden * clear, clear, np.where(hidden, distance, 0), hidden]).astype(np.float32)
     for _ in range(RINGS):
         means = mean @ means
     of_shown, of_said, seen, far, dark = np.split(means, 5, axis=1)

@@ -54,8 +54,7 @@ class ViewSamples:
 
     vertex (n,) index; towards (n, 3) unit vector to the camera; weight (n,) of the pair; image (n, lights) grey radiance;
     data (n, lights) bool, False where saturated, in cast shadow or beside it; gathered (n, lights, terms) what other surfaces send
-    (gleam.py), None where that is not asked for. Both None without shadows: dark (n, lights) bool, True deep in cast shadow and not
-    saturated; hidden (n, lights) bool, True where another part of the mesh hides the light.
+    (gleam.py), None where that is not asked for; dark (n, lights) bool, True deep in cast shadow and not saturated, None without shadows.
     """
 
     vertex: Tensor
@@ -65,7 +64,6 @@ class ViewSamples:
     data: Tensor
     gathered: Tensor | None = None
     dark: Tensor | None = None
-    hidden: Tensor | None = None
 
     def gathered_of(self, part: slice) -> Tensor | None:
         """`gathered` of some pairs."""
@@ -73,8 +71,8 @@ class ViewSamples:
 
     def of_pairs(self, rows: Tensor) -> ViewSamples:
         """Only some of the pairs."""
-        some = (None if a is None else a[rows] for a in (self.gathered, self.dark, self.hidden))
-        return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], *some)
+        gathered, dark = (None if a is None else a[rows] for a in (self.gathered, self.dark))
+        return ViewSamples(self.vertex[rows], self.towards[rows], self.weight[rows], self.image[rows], self.data[rows], gathered, dark)
 
     def of_vertices(self, some: Tensor, count: int) -> ViewSamples:
         """Only the pairs of some of the mesh's `count` vertices, indices (n,)."""
@@ -84,9 +82,9 @@ class ViewSamples:
 
     def of_lights(self, rows: slice | Tensor) -> ViewSamples:
         """Only some of the lights."""
-        some = (None if a is None else a[:, rows].contiguous() for a in (self.gathered, self.dark, self.hidden))
+        gathered, dark = (None if a is None else a[:, rows].contiguous() for a in (self.gathered, self.dark))
         image, data = (values[:, rows].contiguous() for values in (self.image, self.data))
-        return ViewSamples(self.vertex, self.towards, self.weight, image, data, *some)
+        return ViewSamples(self.vertex, self.towards, self.weight, image, data, gathered, dark)
 
     @property
     def pairs_at_once(self) -> int:
@@ -182,14 +180,13 @@ def observe(
         vertex, pair, positions, weights = _pairs(view, caster, among)
         towards = view_directions(view.camera, surface.vertices[vertex])
         image, usable = _sampled(*grey_radiance(view, lights.intensity[i]), positions, weights)
-        dark, hidden = None, None
+        dark = None
         if shadows:
             shade = shade_of(caster, vertex, lights.direction[i], SHADOW_MARGIN)
-            dark, hidden = (torch.from_numpy(values).to(device) for values in (usable & shade.deep, shade.hidden))
-            usable = usable & ~shade.beside
+            usable, dark = usable & ~shade.beside, torch.from_numpy(usable & shade.deep).to(device)
         of_pairs = (vertex, towards.astype(np.float32), pair.astype(np.float32), image, usable)
         vertex_, towards_, pair_, image_, usable_ = (torch.from_numpy(values).to(device) for values in of_pairs)
-        return ViewSamples(vertex_, towards_, pair_, image_, usable_, None, dark, hidden)
+        return ViewSamples(vertex_, towards_, pair_, image_, usable_, dark=dark)
 
     return on_cores(one, range(len(capture.views)))
 
