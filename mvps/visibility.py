@@ -154,7 +154,7 @@ def cast_shadow(caster: RayCaster, vertices: Int, lights: Float) -> Bool:
 def distances_to_shade(caster: RayCaster, vertices: Int, lights: Float) -> Float:
     """(n, lights) from vertices (n,), indices, towards lights (lights, 3) to the part of the mesh that hides them; inf where nothing does,
     and for lights below the horizon."""
-    # Whether anything hides a light takes less to find than what is first, and of few anything does.
+    # Whether anything hides a light takes less to find than what is first, and few are hidden.
     hidden = cast_shadow(caster, vertices, lights)
     row, light = np.nonzero(hidden)
     at = vertices[row]

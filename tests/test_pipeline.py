@@ -143,24 +143,21 @@ def test_a_hull_that_is_good_enough_goes_without_the_occupancy_field() -> None:
     assert np.abs(np.linalg.norm(found.surface.vertices, axis=1) - RADIUS).mean() < 0.1 * pixel
 
 
-COARSE: list[Any] = []
-"""What coarse rounds made of the ball below, once for all tests."""
-
-
-@pytest.mark.parametrize("residual", [0.2, 0.05])
-def test_lights_that_stay_where_they_turned_have_not_settled(residual: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lights_that_stay_where_they_turned_have_not_settled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the model fits badly before the last rounds these keep the lights, whose last step is then none."""
     scene, made = make_sphere(5), coarse.coarse
+    once: list[Any] = []
+    for residual in (2 * POOR_FIT, POOR_FIT / 2):
 
-    def turning(*given: Any) -> Any:
-        COARSE.extend([] if COARSE else [made(*given)])
-        start, rounds = COARSE[0]
-        turned = [*start.rounds[:-1], {**start.rounds[-1], "residual": residual}]
-        return replace(start, status="not settled", text="Lights turned.", rounds=turned), rounds
+        def turning(*given: Any, residual: float = residual) -> Any:
+            once.extend([] if once else [made(*given)])
+            start, rounds = once[0]
+            turned = [*start.rounds[:-1], {**start.rounds[-1], "residual": residual}]
+            return replace(start, status="not settled", text="Lights turned.", rounds=turned), rounds
 
-    monkeypatch.setattr(coarse, "coarse", turning)
-    found = reconstruct.reconstruct(scene.capture, Settings("ball"), None, Progress()).metrics["status"]
-    assert ("Lights turned." in found["text"]) == (residual > POOR_FIT) and (residual <= POOR_FIT or found["name"] == "not settled")
+        monkeypatch.setattr(coarse, "coarse", turning)
+        found = reconstruct.reconstruct(scene.capture, Settings("ball"), None, Progress()).metrics["status"]
+        assert ("Lights turned." in found["text"]) == (residual > POOR_FIT) and (residual <= POOR_FIT or found["name"] == "not settled")
 
 
 def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,15 +183,14 @@ def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> 
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
     out = reconstructed(capture, tmp_path / "held", "--hold-out-views", "4", "--hold-out-lights", "3,9", preset="draft")
     found = figures(out, capture)
-    # A view from 45 degrees aside, of an object with patches whose edges one pixel of error moves: 26 dB and 32 dB measured.
+    # A view from 45 degrees aside, of an object with patches whose edges one pixel of error moves: 24.9 dB and 31.2 dB measured.
     assert found["held_out_views_psnr_db"] > 23 and found["held_out_lights_psnr_db"] > 28
     assert found["map_held_out_normal_error_deg"] < 8
     assert len(read_reconstruction(out).light_names[0]) == 10
 
 
 def test_given_lights_are_taken_as_they_are(capture: Path, tmp_path: Path) -> None:
-    options = ("--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8")
-    out = reconstructed(capture, tmp_path / "given", *options, preset="draft")
+    out = reconstructed(capture, tmp_path / "given", "--calibrated-lights", "--views", "1,2,3,5,6,7", "--lights", "1,2,4,5,7,8")
     read = read_reconstruction(out)
     assert read.views == tuple(f"view_{k:02d}" for k in (1, 2, 3, 5, 6, 7)) and read.light_names[0] == (1, 2, 4, 5, 7, 8)
     found = figures(out, capture)
