@@ -7,6 +7,7 @@ of every view's own pixels (pixels.py)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from mvps.joint.choosing import count_lobes, of_chosen_model
 from mvps.joint.fused import vertex_maps
 from mvps.joint.grey import grey_lights, tensor32
 from mvps.joint.lighting import LIGHT_TIE, LIGHT_VERTICES, solved_lights, with_bounce, with_colours
-from mvps.joint.observe import observe
+from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.state import State, grey_albedo, lit_by, material_of, relative_residuals, senders_of
@@ -77,6 +78,13 @@ def _light_change(a: Lights, b: Lights) -> tuple[float, float]:
     return float(turned.mean()), float(np.abs(after - before).mean() / before.mean())
 
 
+def _lit(state: State, capture: Capture, few: list[ViewSamples], part: tuple[Capture, Lights], vertices: Vertices) -> list[ViewSamples]:
+    """`few` of the capture, and the state's views of a part of it, with what the vertices' surfaces send to them."""
+    sent = senders_of(state, vertices)
+    state.views = lit_by(state, state.views, *part, sent)
+    return state.views if part[0] is capture else lit_by(state, few, capture, state.lights, sent)
+
+
 def photometric_round(
     state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
 ) -> dict[str, float]:
@@ -84,6 +92,7 @@ def photometric_round(
     device = task.device
 
     part, part_lights = thinned(capture, state.lights)
+    state.gathers = {}
     state.views = observe(part, state.surface, part_lights, device, shadows=state.law.shadows)
     mesh_normal = vertex_normals(state.surface)
     vertices = _started(state, part, part_lights, mesh_normal, carried, device)
@@ -105,13 +114,20 @@ def photometric_round(
         vertices = of_chosen_model(state, capture, few, vertices, mesh_normal, patches, task.sharpen)
     free = free_reflectance(tensor32(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights = vertices.normal, grey_lights(part_lights, device)
+    relit = partial(_lit, state, capture, few, (part, part_lights))
+    # Albedo that is solved as if nothing arrived from other surfaces is too large, and so is what it sends.
+    if carried is not None:
+        few = relit(vertices)
     vertices = vertex_steps(state.views, vertices, lights, state.law, free, MATERIAL_STEPS if carried is None else CARRIED_STEPS)
+    lobed = state.lobed
     count_lobes(state, capture, few, vertices, replace(free, sigma=LIGHT_TIE), patches, choosing)
-    sent = senders_of(state, vertices)
-    state.views = lit_by(state, state.views, part, part_lights, sent)
-    few = state.views if part is capture else lit_by(state, few, capture, state.lights, sent)
+    if carried is None or state.lobed != lobed:
+        few = relit(vertices)
     free = with_population(vertices, free)
     vertices, unknown = with_bounce(state, vertices, lights, free)
+    if carried is None:
+        few = relit(vertices)
+        vertices, unknown = with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
     solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
     moved = _light_change(state.lights, solved)

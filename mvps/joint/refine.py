@@ -231,7 +231,7 @@ def refine(
     torch.set_num_threads(1)
     pixel = surface_pixel(capture, surface)
     together = solved_together(lights) if settings.free_lights else 0
-    state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), together=together)
+    state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), lobed=law.gleam > 0, together=together)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
     last: Moves | float = settings.goes_on
