@@ -30,7 +30,20 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from mvps.bounce import BOUNCES, PATCH_EDGES, RAYS, Gather, Sources, gather, gathered, lit_by, lit_by_points, series, sources_on
+from mvps.bounce import (
+    BOUNCES,
+    PATCH_EDGES,
+    RAYS,
+    SHELTERED_EDGES,
+    Gather,
+    Sources,
+    gather,
+    gathered,
+    lit_by,
+    lit_by_points,
+    series,
+    sources_on,
+)
 from mvps.mesh import mean_edge_length, normalise
 from mvps.scene import Float, Law, Material, Surface
 from mvps.shading import PARALLEL, gain_of, lobe_of, returned
@@ -78,7 +91,9 @@ def shiny(law: Law, albedo: Float, weight: Float) -> bool:
 
 def patches_of(surface: Surface, lobes: bool) -> Gather:
     """Its patches, as large as what they send needs: by lobes too, or by diffuse surfaces alone."""
-    return gather(surface, (LOBES_PATCH_EDGES if lobes else PATCH_EDGES) * mean_edge_length(surface))
+    size, sheltered = (LOBES_PATCH_EDGES,) * 2 if lobes else (PATCH_EDGES, SHELTERED_EDGES)
+    edge = mean_edge_length(surface)
+    return gather(surface, size * edge, sheltered * edge)
 
 
 def coarse_senders(surface: Surface, material: Material, grey: bool = False) -> Senders | None:

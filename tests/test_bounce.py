@@ -29,7 +29,7 @@ def hollow() -> Surface:
 
 
 def coarse_sources(surface: Surface, albedo: np.ndarray) -> Sources:
-    return sources_on(gather(surface, PATCH_EDGES * mean_edge_length(surface)), surface, albedo)
+    return sources_on(gather(surface, *(2 * [PATCH_EDGES * mean_edge_length(surface)])), surface, albedo)
 
 
 def under(sources: Sources, direction: np.ndarray, bounce: float) -> np.ndarray:
@@ -45,7 +45,7 @@ def test_a_convex_body_sends_itself_nothing() -> None:
 
 def test_inside_a_closed_surface_other_surfaces_fill_every_hemisphere() -> None:
     # Rays start beside the surface and may leave between facets only there.
-    assert np.abs(occupied(gather(hollow(), 3.0)) - 1).max() < 0.02
+    assert np.abs(occupied(gather(hollow(), 3.0, 3.0)) - 1).max() < 0.02
 
 
 def test_every_place_in_a_part_of_a_ball_sees_the_same_share_of_it_and_its_lit_parts() -> None:
@@ -55,7 +55,7 @@ def test_every_place_in_a_part_of_a_ball_sees_the_same_share_of_it_and_its_lit_p
     low = (inside.vertices[inside.faces][..., 2] < 0).all(1)
     used, number = np.unique(inside.faces[low], return_inverse=True)
     cap = Surface(inside.vertices[used], number.reshape(-1, 3))
-    of = gather(cap, 1.0)
+    of = gather(cap, 1.0, 1.0)
     place = cap.vertices[of.vertex]
     deep = place[:, 2] < -1.0
     height = 10.0 + cap.vertices[:, 2].max()
@@ -90,7 +90,7 @@ def test_two_plates_that_face_each_other_light_each_other_by_their_view_factor()
         plate.apply_translation([0, 0, z])
         plates.append(plate)
     both = trimesh.util.concatenate(plates)
-    of = gather(Surface(np.array(both.vertices), np.array(both.faces)), 2.0)
+    of = gather(Surface(np.array(both.vertices), np.array(both.faces)), 2.0, 2.0)
     place = of.caster.surface.vertices[of.vertex]
     inwards = (np.abs(place[:, :2]).max(1) < 1.5) & (of.normal[:, 2] * place[:, 2] < 0)
     # Ten apart: a side of 20 is twice the distance.
@@ -109,9 +109,18 @@ def test_colours_mix_channel_by_channel_and_interpolate_to_points() -> None:
 
 
 def test_patches_are_the_same_traced_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = gather(hollow(), 2.0)
+    whole = gather(hollow(), 2.0, 2.0)
     monkeypatch.setattr("mvps.bounce.PATCHES_AT_ONCE", 7)
-    parts = gather(hollow(), 2.0)
+    parts = gather(hollow(), 2.0, 2.0)
     assert len(whole.normal) > 70 and (whole.S != parts.S).nnz == 0
     for name in ("row", "start", "column", "along"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
+
+
+def test_patches_are_small_where_light_from_other_parts_counts() -> None:
+    """A closed ball's outside sends itself nothing, its inside receives all."""
+    size, small = 6.0, 3.0
+    assert len(gather(ball(), size, small).vertex) == len(gather(ball(), size, size).vertex)
+    assert (
+        len(gather(hollow(), size, small).vertex) == len(gather(hollow(), small, small).vertex) > len(gather(hollow(), size, size).vertex)
+    )

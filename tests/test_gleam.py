@@ -86,6 +86,7 @@ def ungained(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def patches_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     """Patches of lobed surfaces as large as those of diffuse ones."""
     monkeypatch.setattr("mvps.gleam.LOBES_PATCH_EDGES", PATCH_EDGES)
+    monkeypatch.setattr("mvps.gleam.SHELTERED_EDGES", PATCH_EDGES)
 
 
 @pytest.mark.usefixtures("ungained", "patches_alike")
