@@ -15,7 +15,9 @@ from mvps.joint.grey import grey_lights
 from mvps.joint.lights import light_step, subset, told_by_shadows
 from mvps.joint.observe import ViewSamples, observe, with_gathered
 from mvps.joint.patches import Patches, drawn_patches
+from mvps.joint.photometry import Task, photometric_round
 from mvps.joint.shadowed import bounce_in_shadow
+from mvps.joint.state import State
 from mvps.joint.steps import Anchor, free_reflectance
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, presumed
@@ -113,6 +115,18 @@ def test_without_shadows_nothing_is_told(seen: Seen) -> None:
     none = [replace(s, dark=None) for s in seen.samples]
     for views in (few, none):
         assert bounce_in_shadow(views, seen.vertices, seen.grey, DIFFUSE, 0.0) is None
+
+
+@pytest.mark.parametrize("wrong", [0.8, 1.0])
+def test_rounds_on_the_true_surface_come_to_the_true_strength(seen: Seen, wrong: float) -> None:
+    """From a strength that is right, or too small: samples are lit by albedo that was solved under what arrived."""
+    model = Model(bounce=True)
+    state = State(seen.surface, seen.lights, (), replace(DIFFUSE, bounce=wrong * BOUNCE), model, 0.0, vertices=seen.vertices)
+    task, generator = Task(False, False, False, True, True, CPU), np.random.default_rng(0)
+    for _ in range(3):
+        assert state.vertices is not None
+        photometric_round(state, seen.capture, task, (seen.surface, state.vertices), generator)
+    assert abs(state.law.bounce / BOUNCE - 1) < 0.03
 
 
 def with_noise(seen: Seen, samples: list[ViewSamples], sigma: float, lit_within: bool) -> list[ViewSamples]:
