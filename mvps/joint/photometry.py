@@ -1,7 +1,7 @@
 """The photometric part of a round of Stage II: lights, law, normals and reflectance on a given mesh.
 
-samples (visibility and shadows traced anew) -> vertices for fixed lights -> lights with the vertices eliminated -> vertices -> normals
-of every view's own pixels (pixels.py)
+samples (visibility and shadows traced anew, with what surfaces send each other by what the round before solved) -> vertices for fixed
+lights -> lights with the vertices eliminated -> vertices -> normals of every view's own pixels (pixels.py)
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def photometric_round(
         few = relit(vertices)
     free = with_population(vertices, free)
     vertices, unknown = with_bounce(state, vertices, lights, free)
-    if carried is None:
+    if carried is None and not state.lobed:
         few = relit(vertices)
         vertices, unknown = with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
