@@ -35,8 +35,9 @@ PITS = 0.01
 """Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/findings/hollows.md)."""
 
 HALVED = 0.5
-"""Of the misfit of pits, what is left at most where they stay. 0.19 to 0.40 was left of what hid a hollow, 0.58 and more of what did not or
-of a deeper one, and 0.64 to 1.0 by a round without digging (docs/findings/hollows.md)."""
+"""Of the misfit of pits, what is left at most where they stay; after one round its root, for another to be worth it. 0.19 to 0.40 was left
+of what hid a hollow, 0.58 and more of what did not or of a deeper one, and 0.64 to 1.0 by a round without digging
+(docs/findings/hollows.md)."""
 
 MOST_TURNS = 6
 """As long as it helps, each of them."""
@@ -86,32 +87,39 @@ def hollowed(
             trial = stage_two("coarse refinement", capture, surface, trial, of_turn, settings, progress)
             if not better(trial, best, WORTHWHILE):
                 break
-            best, rounds = trial, rounds + taken + trial.rounds
+            best, rounds = trial, rounds + taken
     return best, rounds
 
 
 def pitted(
     capture: Capture, grid: SignedDistanceGrid, found: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
 ) -> tuple[Refined, list[dict[str, float]]]:
-    """Stage II with pits dug that are too small to show in the whole, and the rounds that this took, one each time: Stage I would fill
-    them again in part. As it was found where there are none, or where the model explains no more in them."""
+    """Stage II with pits dug that are too small to show in the whole, and the rounds that this took: Stage I would fill them again in part.
+    One each time, and another where it is on the way to halving the misfit. As it was found where there are none, or where the model
+    explains no more in them."""
     from mvps.camera import surface_pixel
     from mvps.hollows import beyond_noise, dug, mean_depth, misfit, pits
     from mvps.hull import visual_hull
     from mvps.plan import once
 
     noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
-    best, rounds = found, list[dict[str, float]]()
+    best, rounds, plan = found, list[dict[str, float]](), once(of_turn)
     left = beyond_noise(best.unexplained, noise)
     for _ in range(MOST_TURNS):
         depth = pits(best.surface, left, grid.spacing)
         if mean_depth(best.surface, left, depth) <= PITS * pixel:
             break
-        trial = stage_two("pits", capture, visual_hull(dug(best.surface, left, grid)), best, once(of_turn), settings, progress)
-        after = beyond_noise(trial.unexplained, noise)
         # Ground that was dug is a cell away from the balls at most.
         balls = best.surface.vertices[depth > 0], depth[depth > 0] + grid.spacing
-        if misfit(trial.surface, after, *balls) > HALVED * misfit(best.surface, left, *balls):
+        before = misfit(best.surface, left, *balls)
+        trial, taken, surface = best, list[dict[str, float]](), visual_hull(dug(best.surface, left, grid))
+        for worth_another in (np.sqrt(HALVED), HALVED):
+            trial = stage_two("pits", capture, surface, trial, plan, settings, progress, trial.carried if taken else None)
+            after, surface, taken = beyond_noise(trial.unexplained, noise), trial.surface, taken + trial.rounds
+            share = misfit(surface, after, *balls) / before
+            if share <= HALVED or share > worth_another:
+                break
+        if share > HALVED:
             break
-        best, left, rounds = trial, after, rounds + trial.rounds
+        best, left, rounds = trial, after, rounds + taken
     return best, rounds

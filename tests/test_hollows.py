@@ -122,7 +122,7 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
 
     def refined() -> Any:
         unexplained = np.where(bad, next(values), 0.0)
-        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), rounds=[{"number": float(next(counted))}])
+        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), carried=None, rounds=[{"number": float(next(counted))}])
 
     monkeypatch.setattr("mvps.digging.stage_one", lambda *_: wide)
     repeated: dict[str, set[bool]] = {}
@@ -167,8 +167,16 @@ def test_pits_are_what_the_grid_can_hold() -> None:
 
 @pytest.mark.parametrize(
     ("left", "made", "kept"),
-    [((0.1,), 0, 0), ((0.6, 0.1), 1, 1), ((0.6, 0.5), 1, 0), ((0.9, 0.6, 0.4, 0.35), 3, 2), ((0.8, 1e8), 1, 0)],
-    ids=["no sign", "there", "hardly better", "pit in pit", "worse"],
+    [
+        ((0.1,), 0, 0),
+        ((0.6, 0.1), 1, 1),
+        ((0.6, 0.52), 1, 0),
+        ((0.6, 0.5, 0.15), 2, 2),
+        ((0.6, 0.5, 0.45), 2, 0),
+        ((0.9, 0.6, 0.4, 0.35), 3, 2),
+        ((0.8, 1e8), 1, 0),
+    ],
+    ids=["no sign", "there", "hardly better", "there after two", "not after two", "pit in pit", "worse"],
 )
 def test_pits_stay_that_halve_what_is_left_unexplained_in_them(
     left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch
@@ -182,7 +190,7 @@ def test_pits_stay_that_halve_what_is_left_unexplained_in_them(
 
     def refined() -> Any:
         unexplained = np.where(bad, next(values), 0.0)
-        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), rounds=[{"number": float(next(counted))}])
+        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), carried=None, rounds=[{"number": float(next(counted))}])
 
     monkeypatch.setattr("mvps.digging.stage_two", lambda *_: refined())
     monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
