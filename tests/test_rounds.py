@@ -78,3 +78,16 @@ def test_of_a_model_that_does_not_fit_no_round_is_done_again(scene: SphereScene,
     (first,), _ = swollen(scene, 0.5)
     monkeypatch.setattr(rounds, "POOR_FIT", 0.0)
     assert len(swollen(scene, 0.5, still=0.6 * first)[0]) == 1
+
+
+def test_vertices_that_have_far_to_go_have_not_settled(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=0.01),), free_lights=False)
+    first, second = refined_from(scene, 0.5, plan).rounds
+    # One round says nothing of the next.
+    assert first["left_px"] == 0 < second["left_px"]
+    told = []
+    for share in (0.5, 2.0):
+        monkeypatch.setattr("mvps.joint.refine.AT_REST_PIXELS", share * second["left_px"])
+        told.append(refined_from(scene, 0.5, plan))
+    assert told[0].status == "not settled" and "px to go in the mean" in told[0].text
+    assert "px to go in the mean" not in told[1].text

@@ -120,7 +120,8 @@ def refine_view(
         if changes["residual"] > WORSE * min((before["residual"] for before in account), default=np.inf):
             break
         state, start = attempt, following
-        account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, "vertex_change_px": 0.0})
+        moves = {"vertex_change_px": 0.0, "left_px": 0.0}
+        account.append({"round": float(number), "vertices": float(len(surface.vertices)), **changes, **moves})
         on_round(number, account[-1])
     assert state is not None
     refined = finished(state, settings, account, generator)
