@@ -87,7 +87,7 @@ def hollowed(
             trial = stage_two("coarse refinement", capture, surface, trial, of_turn, settings, progress)
             if not better(trial, best, WORTHWHILE):
                 break
-            best, rounds = trial, rounds + taken
+            best, rounds = trial, rounds + taken + trial.rounds
     return best, rounds
 
 

@@ -90,7 +90,6 @@ def photometric_round(
 ) -> dict[str, float]:
     """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
     device = task.device
-
     part, part_lights = thinned(capture, state.lights)
     state.gathers = {}
     state.views = observe(part, state.surface, part_lights, device, shadows=state.law.shadows)
