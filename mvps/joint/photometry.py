@@ -107,7 +107,6 @@ def photometric_round(
         among = np.zeros(len(mesh_normal), bool)
         among[patches.vertex.cpu().numpy()] = True
         few = observe(capture, state.surface, state.lights, device, among, state.law.shadows)
-
     choosing = task.choose and not state.trials
     if choosing:
         vertices = of_chosen_model(state, capture, few, vertices, mesh_normal, patches, task.sharpen)
@@ -124,6 +123,7 @@ def photometric_round(
         few = relit(vertices)
     free = with_population(vertices, free)
     vertices, unknown = with_bounce(state, vertices, lights, free)
+    # A first round's albedo was so solved: once more, under what it tells now. Where lobes take part shadows tell nothing.
     if carried is None and not state.lobed:
         few = relit(vertices)
         vertices, unknown = with_bounce(state, vertices, lights, free)
