@@ -31,6 +31,9 @@ HIDDEN = 0.2
 """Mean depth, pixels, of the hollows that may be hidden where nothing fits (hollows.py) from which they are dug for. Seven captures without
 hollows that Stage I leaves are at 0.02 to 0.1, a vessel and a bowl at 1.2 and 1.4 (docs/findings/hollows.md)."""
 
+LEFT = 0.1
+"""The same where a hollow was dug and stayed: no more than objects without any have."""
+
 PITS = 0.01
 """Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/findings/hollows.md)."""
 
@@ -65,7 +68,7 @@ def hollowed(
         return beyond_noise(of.unexplained, noise)
 
     def worth_digging(of: Refined) -> bool:
-        return hidden(of.surface, unexplained(of)) > HIDDEN * pixel
+        return hidden(of.surface, unexplained(of)) > (HIDDEN if of is found else LEFT) * pixel
 
     def better(after: Refined, before: Refined, share: float = 1.0) -> bool:
         return bool(np.nanmean(unexplained(after)) < share * np.nanmean(unexplained(before)))
@@ -77,7 +80,7 @@ def hollowed(
                 return best, rounds
             trial, taken = best, []
             for _ in range(MOST_TURNS):
-                before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth))
+                before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth, walls=True))
                 trial = stage_two("hollows", capture, surface, before, once(of_turn), settings, progress)
                 taken += trial.rounds
                 if not (better(trial, before) and worth_digging(trial)):

@@ -7,9 +7,10 @@ that the model leaves unexplained, beyond their noise. With U the vertices above
     L(v) = distance from v in U to the nearest vertex that fits, 0 elsewhere
 
 a hollow under a patch of U is likely to be about as deep as the patch is wide. So balls of radius min(L, half of the solid's thickness
-inwards) around U are cut out of it, a pit that ends at the patch's edge and never meets another side. Of what is then seen the model
-explains more if the hollow is there: the caller sees to that, and digs again (space carving, Kutulakos and Seitz 2000, by patches and with
-a way back). The mean of L over what is seen,
+inwards) around U are cut out of it, a pit that ends at the patch's edge and never meets another side. A wall that is thin beside the pit
+would be eaten by halves all the same, pit by pit: where its other side fits, wide pits leave as much of it as the grid can hold. Of what is
+then seen the model explains more if the hollow is there: the caller sees to that, and digs again (space carving, Kutulakos and Seitz 2000,
+by patches and with a way back). The mean of L over what is seen,
 
     hidden_px = mean of L, pixels,
 
@@ -29,7 +30,7 @@ from scipy.spatial import cKDTree
 
 from mvps.cores import neighbours
 from mvps.mesh import vertex_areas, vertex_normals
-from mvps.scene import Float, Int, SignedDistanceGrid, Surface
+from mvps.scene import Bool, Float, Int, SignedDistanceGrid, Surface
 from mvps.visibility import ray_caster
 
 MISFIT = 0.2
@@ -39,6 +40,12 @@ makes a model a bad one for a whole object. From 0.1 on digging goes into what m
 
 EXACT_CELLS = 3
 """From the surface; farther off distances count cells."""
+
+WALL_CELLS = 2.0
+"""Of a wall whose one side fits, what wide pits leave: a grid holds a plate of two cells wherever its nodes lie."""
+
+BEHIND = 0.5
+"""Cosine of the angle between a vertex's normal and the way to it, above which a point lies behind the vertex and not beside it."""
 
 
 def beyond_noise(residual: Float, noise: float) -> Float:
@@ -103,8 +110,19 @@ def thickness(surface: Surface, vertex: Int) -> Float:
     return hits.distance + caster.offset
 
 
-def dug(surface: Surface, unexplained: Float, like: SignedDistanceGrid, share: float = 1.0) -> SignedDistanceGrid:
-    """The solid without the balls, on the nodes of another grid. share: of L that balls have as their radius."""
+def in_walls(points: Float, surface: Surface, unexplained: Float, depth: float) -> Bool:
+    """(n,) which of the points (n, 3) lie no deeper than `depth` behind a vertex that fits."""
+    fits = unexplained <= MISFIT
+    distance, nearest = neighbours(cKDTree(surface.vertices[fits]), points)
+    outwards = surface.vertices[fits][nearest] - points
+    along = (outwards * vertex_normals(surface)[fits][nearest]).sum(1)
+    within: Bool = (distance < depth) & (along > BEHIND * distance)
+    return within
+
+
+def dug(surface: Surface, unexplained: Float, like: SignedDistanceGrid, share: float = 1.0, walls: bool = False) -> SignedDistanceGrid:
+    """The solid without the balls, on the nodes of another grid. share: of L that balls have as their radius; walls: what lies within
+    WALL_CELLS behind a vertex that fits stays."""
     depth = share * clearance(surface, unexplained)
     vertex = np.flatnonzero(depth >= like.spacing)
     radius = np.minimum(depth[vertex], thickness(surface, vertex) / 2)
@@ -117,4 +135,9 @@ def dug(surface: Surface, unexplained: Float, like: SignedDistanceGrid, share: f
         around = values[box]
         offset = grid.origin + grid.spacing * (low + np.indices(around.shape).reshape(3, -1).T) - centre
         np.maximum(around, (r - np.linalg.norm(offset, axis=1)).reshape(around.shape), out=around)
+    if walls:
+        cut = np.stack(np.nonzero(values > grid.values))
+        nodes = grid.origin + grid.spacing * cut.T
+        stays = tuple(cut[:, in_walls(nodes, surface, unexplained, WALL_CELLS * grid.spacing)])
+        values[stays] = grid.values[stays]
     return SignedDistanceGrid(values, grid.origin, grid.spacing)

@@ -12,7 +12,7 @@ from sphere_scene import make_sphere
 
 from mvps.coarse import begin
 from mvps.digging import MOST_TURNS, hollowed, pitted
-from mvps.hollows import beyond_noise, clearance, dug, hidden, mean_depth, misfit, pits, solid, thickness
+from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, mean_depth, misfit, pits, solid, thickness
 from mvps.hull import visual_hull
 from mvps.mesh import vertex_areas, vertex_normals
 from mvps.passes import stage_two
@@ -90,6 +90,25 @@ def test_a_pit_of_balls(height: float, depth: float) -> None:
     assert abs(z.min()) < 0.03
 
 
+@pytest.mark.parametrize(("walls", "radius"), [(False, 0.98), (True, 1 - WALL_CELLS * 0.05)])
+def test_wide_pits_leave_walls_whose_other_side_fits(walls: bool, radius: float) -> None:
+    """Nothing of the top fits: a ball as wide as the cylinder leaves hardly anything of what stands beside it."""
+    surface = cylinder()
+    x, y, z = surface.vertices.T
+    unexplained = np.where((z > 2 - 1e-6) & (np.hypot(x, y) < 0.99), 1.0, 0.01)
+    pit = visual_hull(dug(surface, unexplained, around(surface), walls=walls)).vertices
+    # The sides are at 0.995 and more, between the corners of the cylinder.
+    inside = pit[(pit[:, 2] > 1.75) & (pit[:, 2] < 1.85) & (np.hypot(pit[:, 0], pit[:, 1]) < 0.99)]
+    assert np.median(np.hypot(inside[:, 0], inside[:, 1])) == pytest.approx(radius, abs=0.02)
+
+
+def test_points_in_walls_lie_behind_what_fits() -> None:
+    surface = cylinder()
+    unexplained = np.where(surface.vertices[:, 2] > 1, 0.5, 0.01)
+    points = np.array([[0.95, 0, 0.5], [0.85, 0, 0.5], [1.05, 0, 0.5], [0.95, 0, 1.5], [0.7, 0, 0.05]])
+    assert in_walls(points, surface, unexplained, 0.12).tolist() == [True, False, False, False, True]
+
+
 def test_nothing_to_dig_leaves_the_solid() -> None:
     surface = cylinder()
     assert np.array_equal(
@@ -133,7 +152,7 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
 
     monkeypatch.setattr("mvps.digging.stage_two", stage_two)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
+    monkeypatch.setattr("mvps.hollows.dug", lambda *_, **__: None)
     monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
     monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
     found = refined()
