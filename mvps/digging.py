@@ -32,7 +32,7 @@ HIDDEN = 0.2
 hollows that Stage I leaves are at 0.02 to 0.1, a vessel and a bowl at 1.2 and 1.4 (docs/findings/hollows.md)."""
 
 LEFT = 0.1
-"""The same where a hollow was dug and stayed: no more than objects without any have."""
+"""The same after a dig: no more than objects without any have."""
 
 PITS = 0.01
 """Mean depth, pixels, of pits from which they are dug: runs with other seeds differ by up to as much (docs/findings/hollows.md)."""

@@ -109,11 +109,12 @@ def test_points_in_walls_lie_behind_what_fits() -> None:
     assert in_walls(points, surface, unexplained, 0.12).tolist() == [True, False, False, False, True]
 
 
-def test_nothing_to_dig_leaves_the_solid() -> None:
+@pytest.mark.parametrize("left", [0.01, 1.0], ids=["all fits", "nothing fits"])
+@pytest.mark.parametrize("walls", [False, True])
+def test_nothing_to_dig_leaves_the_solid(left: float, walls: bool) -> None:
     surface = cylinder()
-    assert np.array_equal(
-        dug(surface, np.full(len(surface.vertices), 0.01), around(surface)).values, solid(surface, around(surface)).values
-    )
+    as_it_is = solid(surface, around(surface))
+    assert np.array_equal(dug(surface, np.full(len(surface.vertices), left), around(surface), walls=walls).values, as_it_is.values)
 
 
 @pytest.mark.parametrize(
