@@ -164,6 +164,31 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
     assert (best is found) == (kept == 0)
 
 
+@pytest.mark.parametrize(
+    ("depths", "made"),
+    [((0.15,), 0), ((0.25, 0.05, 0.05), 2), ((0.25, 0.15, 0.05, 0.15, 0.05, 0.05), 5)],
+    ids=["no wide hollow", "nothing left", "less left than it took to begin"],
+)
+def test_after_a_dig_less_may_be_hidden(depths: tuple[float, ...], made: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """depths: what may be hidden, pixels, before each turn and after each pit; made: rounds, one a pit and one after Stage I."""
+    surface, told, left = cylinder(), iter(depths), iter(0.5**k for k in range(20))
+
+    def refined(*_: Any) -> Any:
+        return SimpleNamespace(surface=surface, unexplained=np.full(3, next(left)), maps=(), carried=None, rounds=[{}])
+
+    monkeypatch.setattr("mvps.camera.surface_pixel", lambda *_: 1.0)
+    monkeypatch.setattr("mvps.hollows.hidden", lambda *_: next(told))
+    monkeypatch.setattr("mvps.digging.stage_one", lambda *_: surface)
+    monkeypatch.setattr("mvps.digging.stage_two", refined)
+    monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    monkeypatch.setattr("mvps.hollows.dug", lambda *_, **__: None)
+    monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
+    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: surface)
+    found = refined()
+    _, rounds = hollowed(make_sphere(3).capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
+    assert len(rounds) == made and next(told, None) is None
+
+
 def test_misfit_is_of_what_is_seen_in_the_balls() -> None:
     surface = cylinder()
     top = np.array([[0.0, 0.0, 2.0]])

@@ -56,7 +56,7 @@ STILL = 0.5
 
 AT_REST_PIXELS = 0.1
 """What vertices may have to go on in the mean after two rounds on one mesh: 0.06 at most on nine captures that came out right, 0.13 and
-0.16 where a bowl's floor stayed bridged (docs/findings/limits.md)."""
+0.16 where a bowl's floor stayed bridged (docs/findings/stage_one.md)."""
 
 MOSTLY = 0.6
 """Part of a mesh's edges that creases split, above which the object has more detail than the mesh: halves of these are split once more.
