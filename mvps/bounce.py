@@ -11,7 +11,7 @@ way of another surface varies slowly, so G is computed at few vertices, one for 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from mvps.cores import neighbours
 from mvps.mesh import face_normals, mean_edge_length, vertex_normals
-from mvps.scene import Float, Int, Surface
+from mvps.scene import Bool, Float, Int, Surface
 from mvps.visibility import RayCaster, cast_shadow, ray_caster
 
 RAYS = 128
@@ -55,7 +55,8 @@ class Gather:
     spread (n,) variance of its vertices' normals about its own, along a tangent.
 
     Of the rays that meet another part: row (rays,) patch that they start from, in order, start (n + 1,) where a patch's begin; column
-    (rays,) patch that they meet; along (rays, 3) unit.
+    (rays,) patch that they meet; along (rays, 3) unit. sending: patches that are met, the only ones whose own light is asked for; shadow:
+    of lights that were asked for, by their direction, which of these are in cast shadow, in bits: a round asks again and again.
     """
 
     caster: RayCaster
@@ -68,6 +69,8 @@ class Gather:
     start: Int
     column: Int
     along: NDArray[np.float32]
+    sending: Int
+    shadow: dict[bytes, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 def gather(surface: Surface, size: float, sheltered: float) -> Gather:
@@ -84,7 +87,8 @@ def gather(surface: Surface, size: float, sheltered: float) -> Gather:
     S = sp.csr_matrix((np.full(len(rows), 1 / RAYS, np.float32), (rows, columns)), (len(vertex), len(vertex)))
     spread = np.bincount(patch, ((normals - normal[patch]) ** 2).sum(1) / 2) / np.bincount(patch)
     start = np.searchsorted(rows, np.arange(len(vertex) + 1))
-    return Gather(caster, vertex, normal, S, cKDTree(surface.vertices[vertex]), spread, rows, start, columns, along)
+    tree, sending = cKDTree(surface.vertices[vertex]), np.unique(columns)
+    return Gather(caster, vertex, normal, S, tree, spread, rows, start, columns, along, sending)
 
 
 def _cut(surface: Surface, normals: Float, size: Float) -> tuple[Int, Int]:
@@ -152,10 +156,21 @@ def _around(normal: Float, directions: Float) -> Float:
 
 
 def lit_by(of: Gather, direction: Float) -> NDArray[np.float32]:
-    """(n, lights) max(n.l, 0) * shadow of the patches."""
-    shadow = cast_shadow(of.caster, of.vertex, direction)
-    lit: NDArray[np.float32] = (np.maximum(of.normal @ direction.T, 0) * ~shadow).astype(np.float32)
+    """(n, lights) max(n.l, 0) * shadow of the patches that send, 0 of others."""
+    lit = np.zeros((len(of.normal), len(direction)), np.float32)
+    lit[of.sending] = np.maximum(of.normal @ direction.T, 0)[of.sending] * ~_shadows(of, direction)
     return lit
+
+
+def _shadows(of: Gather, direction: Float) -> Bool:
+    """(sending, lights) whether another part hides the lights from the patches that send."""
+    lights = [one.tobytes() for one in direction]
+    new = [k for k, light in enumerate(lights) if light not in of.shadow]
+    if new:
+        bits = np.packbits(cast_shadow(of.caster, of.vertex[of.sending], direction[new]), axis=0)
+        of.shadow.update((lights[k], bits[:, column]) for column, k in enumerate(new))
+    known = np.stack([of.shadow[light] for light in lights], 1)
+    return np.unpackbits(known, axis=0, count=len(of.sending)).view(bool)
 
 
 def series(S: sp.csr_matrix, direct: NDArray[np.float32], again: NDArray[np.float32], bounces: int) -> NDArray[np.float32]:

@@ -53,12 +53,12 @@ alike with 4, 16 and 100 (docs/findings/reflectance.md)."""
 
 def half_length(v_dot_l: Tensor) -> Tensor:
     """|v + l| for v . l."""
-    return (2 + 2 * v_dot_l).clamp_min(PARALLEL).sqrt()
+    return (2 * v_dot_l).add_(2).clamp_min(PARALLEL).sqrt_()
 
 
 def gain(length: Tensor) -> Tensor:
     """Of lobes, for |v + l|."""
-    return (4 / length**2).clamp_max(STEEPEST)
+    return (4 / length.square()).clamp_max(STEEPEST)
 
 
 def gain_of(length: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -76,7 +76,7 @@ def half_dot_normal(n_dot_v: Tensor, n_dot_l: Tensor, v_dot_l: Tensor) -> Tensor
 def lobe(h_dot_n: Tensor, sharpness: float | Tensor, microfacet: bool) -> tuple[Tensor, Tensor | float]:
     """A lobe's value (...) for h . n (...), and the derivative of its logarithm by h . n."""
     if not microfacet:
-        return torch.exp((sharpness * (h_dot_n - 1)).clamp_min(FAINTEST)), sharpness
+        return (h_dot_n - 1).mul_(sharpness).clamp_min(FAINTEST).exp_(), sharpness
     spread = 1 + sharpness / 4 * (1 - h_dot_n**2)
     return spread**-2, sharpness * h_dot_n / spread
 

@@ -199,8 +199,9 @@ def shadows(caster: RayCaster, points: Float, normal: Float, lights: Float) -> B
     step = max(1, RAYS_PER_CALL // max(1, len(lights)))
     for start in range(0, len(points), step):
         part = slice(start, start + step)
-        above = normal[part] @ lights.T > 0
-        columns = np.nonzero(above)[1]
-        if len(columns):
-            shadow[part][above] = caster.blocked(np.repeat(origins[part], above.sum(1), axis=0), directions[columns])
+        above = np.flatnonzero(normal[part] @ lights.T > 0)
+        if len(above):
+            point, light = np.divmod(above, len(lights))
+            hidden = caster.blocked(np.take(origins[part], point, axis=0), np.take(directions, light, axis=0))
+            shadow[part].reshape(-1)[above] = hidden
     return shadow

@@ -72,7 +72,7 @@ def test_reports_that_no_float32_holds_say_nothing_of_their_vertex_alone() -> No
         b[:, 2] = 1e25 * (-1) ** i
         weight = np.ones((5, 9), np.float32)
         weight[2, :4] = 0 if i else 1
-        return [Swept(np.arange(5)[some], np.ones(5, np.float32), weight, b)]
+        return [Swept(np.arange(5)[some], np.ones(5, np.float32)[some], weight[some], b[:, some])]
 
     with np.errstate(all="ignore"):
         found = lowest_of(5, report, [np.arange(5)] * 4, offsets)

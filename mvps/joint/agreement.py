@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import view_directions
-from mvps.cores import on_cores
+from mvps.cores import at_a_time, on_cores
 from mvps.mesh import vertex_normals
 from mvps.scene import Camera, Capture, Float, Int, NormalMap, Surface, View
 from mvps.silhouette import REMAP_LIMIT, sampled
@@ -123,15 +123,19 @@ def agreement(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...], s
 def lowest_of(count: int, reports: Callable[[int, slice], list[Swept]], seen: list[Int], offsets: Float) -> Agreement:
     """Where each of `count` vertices agrees best. reports(i, some): what view i says of `some` of seen[i], its vertices in order."""
 
+    # As many to each core.
+    calls = at_a_time() * -(-count // (at_a_time() * VERTICES_AT_ONCE))
+    size = -(-count // calls)
+
     def of_block(start: int) -> Agreement:
-        stop, found = min(start + VERTICES_AT_ONCE, count), []
+        stop, found = min(start + size, count), []
         for i, index in enumerate(seen):
             some = slice(*(int(k) for k in np.searchsorted(index, (start, stop))))
             if some.start < some.stop:
                 found += [replace(of, rows=of.rows - start) for of in reports(i, some)]
         return _lowest(*_costs(found, stop - start, len(offsets)), offsets)
 
-    blocks = on_cores(of_block, range(0, count, VERTICES_AT_ONCE))
+    blocks = on_cores(of_block, range(0, count, size))
     return Agreement(np.concatenate([block.offset for block in blocks]), np.concatenate([block.sigma for block in blocks]))
 
 

@@ -187,23 +187,24 @@ def evaluate(
     """The image model for normal, towards (..., n, 3) and reflectance (..., n, 1 + lobes) under all lights of a view, or of several that
     stand first (Batch). gathered (..., n, lights, 1 or 2 + lobes): G."""
     light, intensity = lights.direction, lights.intensity
-    n_dot_l = (normal @ light.mT).clamp_min(0)
+    n_dot_l = (normal @ light.mT).clamp_min_(0)
     n_dot_v = (normal * towards).sum(-1, keepdim=True)
     c = half_length(towards @ light.mT)
     # Below the horizon h . n is of no account, there is no light; but it must not grow with a light opposite to the view.
-    half = ((n_dot_v + n_dot_l) / c).clamp_(-1, 1)
+    half = (n_dot_v + n_dot_l).div_(c).clamp_(-1, 1)
     q, albedo = n_dot_l * intensity, reflectance[..., :1]
     (of_l, slope_l), (of_v, slope_v) = _grazing(n_dot_l), _grazing(n_dot_v.clamp_min(0))
     # Factors of a point alone are multiplied before those of its samples.
-    D_l, D_v, slant = 1 + law.grazing * of_l, 1 + law.grazing * of_v, albedo * law.grazing
+    D_l, D_v, slant = (law.grazing * of_l).add_(1), 1 + law.grazing * of_v, albedo * law.grazing
     D = D_l * D_v
-    specular, slope, basis, gained = torch.zeros_like(q), torch.zeros_like(q), [q * D], gain(c)
+    specular, slope, basis = torch.zeros_like(q), torch.zeros_like(q), [q * D]
+    gained = gain(c)
     for k, s in enumerate(law.sharpness):
         value, steepness = lobe(half, s, law.microfacet)
         value = value * gained
         weighted = value * reflectance[..., k + 1, None]
-        specular = specular + weighted
-        slope = slope + steepness * weighted
+        specular += weighted
+        slope += weighted.mul_(steepness)
         basis.append(q * value)
     indirect = gleamed = rest = torch.zeros_like(q)
     unsure = None
@@ -211,14 +212,14 @@ def evaluate(
         received = (intensity[..., None] * gathered).unbind(-1)
         indirect = albedo * received[0]
         rest = law.bounce * indirect
-        basis[0] = basis[0] + law.bounce * received[0]
+        basis[0] += law.bounce * received[0]
         if len(received) > 1:
             gleamed = sum((reflectance[..., k, None] * g for k, g in enumerate(received[1:])), torch.zeros_like(q))
             by_lobes = law.gleam * gleamed
             rest, unsure = rest + by_lobes, LOBES_ERROR * by_lobes
             basis = [own + law.gleam * g for own, g in zip(basis, received[1:], strict=True)]
-    total = albedo * D + specular
-    predicted = q * total + rest
+    total = (albedo * D).add_(specular)
+    predicted = (q * total).add_(rest)
     of_light, of_view = slant * D_v * slope_l, slant * slope_v * D_l
     return Shaded(
         n_dot_l.sign(),
@@ -249,12 +250,11 @@ def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
 
 def vertex_derivatives(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> list[Tensor]:
     """3 + lobes derivatives (..., n, lights) of the samples by two tangential steps of the normal, the albedo and the weights."""
-    along_light = shaded.lit * lights.intensity * shaded.reflectance
     q = shaded.n_dot_l * lights.intensity
-    along_half = q * shaded.slope / shaded.c
-    along_light = along_light + along_half + q * shaded.of_light
-    along_view = along_half + q * shaded.of_view
-    columns = [along_light * (t @ lights.direction.mT) + along_view * (t * towards).sum(-1, keepdim=True) for t in frame]
+    along_half = (q * shaded.slope).div_(shaded.c)
+    along_light = (shaded.lit * lights.intensity).mul_(shaded.reflectance).add_(along_half).add_(q * shaded.of_light)
+    along_view = along_half.add_(q.mul_(shaded.of_view))
+    columns = [(t @ lights.direction.mT).mul_(along_light).add_(along_view * (t * towards).sum(-1, keepdim=True)) for t in frame]
     return columns + shaded.basis
 
 
@@ -280,8 +280,10 @@ def law_derivatives(shaded: Shaded, reflectance: Tensor, lights: DirectionalLigh
 
 def robust(residual: Tensor, scale: Tensor, unsure: Tensor | None) -> Tensor:
     """Cauchy's weight of residuals (..., n, lights) with scale (..., n), to whose square unsure (..., n, lights) adds its own."""
-    excess = 1 + (residual / (CAUCHY_95 * scale[..., None])) ** 2
-    return 1 / (excess if unsure is None else excess + (unsure / scale[..., None]) ** 2)
+    excess = (residual / (CAUCHY_95 * scale[..., None])).square_().add_(1)
+    if unsure is not None:
+        excess += (unsure / scale[..., None]).square_()
+    return excess.reciprocal_()
 
 
 def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law) -> NormalEquations:
@@ -293,7 +295,7 @@ def _vertex_equations(views: list[ViewSamples], vertices: Vertices, lights: list
         index, towards = batch.vertex, batch.towards
         shaded = evaluate(vertices.normal[index], vertices.reflectance[index], towards, batch.lights, law, batch.gathered)
         residual = shaded.predicted - batch.image
-        weight = batch.weight * robust(residual, vertices.scale[index], shaded.unsure)
+        weight = robust(residual, vertices.scale[index], shaded.unsure).mul_(batch.weight)
         rows = torch.stack([*vertex_derivatives(shaded, (first[index], second[index]), towards, batch.lights), residual], -2)
         batch.added(sums, (rows * weight[..., None, :]) @ rows.mT)
         batch.added(count, weight.sum(-1))

@@ -18,9 +18,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mvps.camera import footprint, project, view_directions
+from mvps.cores import on_cores
 from mvps.joint.vertices import MASK_SIGMA_PIXELS
 from mvps.mesh import edges
-from mvps.scene import Bool, Capture, Float, Int, Surface
+from mvps.scene import Bool, Capture, Float, Int, Surface, View
 from mvps.silhouette import sampled
 from mvps.visibility import RayCaster
 from solvers.linear import CholeskyLike
@@ -94,17 +95,25 @@ def _back_behind(caster: RayCaster, free: Int, capture: Capture, front: _Fronts)
     moved a pixel behind it where they are least in front."""
     points, normal = caster.surface.vertices[free], caster.vertex_normals[free]
     least, moved = np.full(len(points), np.inf), points.copy()
-    if front.caster is None:
+    caster_of_front = front.caster
+    if caster_of_front is None:
         return np.zeros(len(points), bool), moved
-    for view, faces in zip(capture.views, front.seen, strict=True):
+
+    def in_front(view: View, faces: Bool) -> tuple[Int, Float]:
+        """Which points show the view their back, and how far before a face (faces,) that it sees."""
         away = -view_directions(view.camera, points)
         chosen = np.flatnonzero((normal * away).sum(1) > 0)
         chosen = chosen[~caster.occluded(points[chosen] - caster.offset * away[chosen], -away[chosen])]
-        hits = front.caster.first_hits(points[chosen], away[chosen])
-        nearer = (hits.face >= 0) & faces[hits.face] & (hits.distance < least[chosen])
-        chosen, depth = chosen[nearer], hits.distance[nearer]
+        hits = caster_of_front.first_hits(points[chosen], away[chosen])
+        before = (hits.face >= 0) & faces[hits.face]
+        return chosen[before], hits.distance[before]
+
+    for view, (chosen, depth) in zip(capture.views, on_cores(in_front, capture.views, front.seen), strict=True):
+        nearer = depth < least[chosen]
+        chosen, depth = chosen[nearer], depth[nearer]
         least[chosen] = depth
-        moved[chosen] = points[chosen] + (depth + footprint(view.camera, points[chosen]))[:, None] * away[chosen]
+        away = -view_directions(view.camera, points[chosen])
+        moved[chosen] = points[chosen] + (depth + footprint(view.camera, points[chosen]))[:, None] * away
     found: Bool = np.isfinite(least)
     return found, moved
 
