@@ -9,7 +9,7 @@ import trimesh
 from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, lit_by, sources_on
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Surface
-from mvps.visibility import cast_shadow
+from mvps.visibility import RayCaster, cast_shadow
 
 
 def occupied(of: Gather) -> np.ndarray:
@@ -124,3 +124,26 @@ def test_patches_are_small_where_light_from_other_parts_counts() -> None:
     assert (
         len(gather(hollow(), size, small).vertex) == len(gather(hollow(), small, small).vertex) > len(gather(hollow(), size, size).vertex)
     )
+
+
+def test_shadows_are_traced_once_for_a_light_and_of_patches_that_send_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two balls: their far sides meet no ray. In whatever order lights are asked for, they say what rays say."""
+    two = [trimesh.creation.icosphere(subdivisions=3, radius=1.0).apply_translation((x, 0, 0)) for x in (-1.5, 1.5)]
+    both = trimesh.util.concatenate(two)
+    of = gather(Surface(np.array(both.vertices), np.array(both.faces)), 0.3, 0.3)
+    lights = np.array([[0.0, 0, 1], [0.8, 0, 0.6], [0, -0.6, 0.8], [-0.6, 0.64, 0.48]])
+    wanted = (np.maximum(of.normal @ lights.T, 0) * ~cast_shadow(of.caster, of.vertex, lights)).astype(np.float32)
+    traced: list[int] = []
+
+    def counted(caster: RayCaster, vertices: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        traced.append(len(direction))
+        assert len(vertices) == len(of.sending)
+        return cast_shadow(caster, vertices, direction)
+
+    monkeypatch.setattr("mvps.bounce.cast_shadow", counted)
+    quiet = np.setdiff1d(np.arange(len(of.normal)), of.sending)
+    assert len(quiet) > 0 and of.S[:, quiet].nnz == 0
+    for some in ([2], [0, 2], [3, 1, 0], [0, 1, 2, 3]):
+        lit = lit_by(of, lights[some])
+        assert np.array_equal(lit[of.sending], wanted[of.sending][:, some]) and not lit[quiet].any()
+    assert traced == [1, 1, 2] and wanted[of.sending].any() and not wanted[of.sending].all()
