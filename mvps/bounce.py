@@ -169,8 +169,10 @@ def _shadows(of: Gather, direction: Float) -> Bool:
     if new:
         bits = np.packbits(cast_shadow(of.caster, of.vertex[of.sending], direction[new]), axis=0)
         of.shadow.update((lights[k], bits[:, column]) for column, k in enumerate(new))
-    known = np.stack([of.shadow[light] for light in lights], 1)
-    return np.unpackbits(known, axis=0, count=len(of.sending)).view(bool)
+    bits = np.empty((-(-len(of.sending) // 8), len(lights)), np.uint8)
+    for column, light in enumerate(lights):
+        bits[:, column] = of.shadow[light]
+    return np.unpackbits(bits, axis=0, count=len(of.sending)).view(bool)
 
 
 def series(S: sp.csr_matrix, direct: NDArray[np.float32], again: NDArray[np.float32], bounces: int) -> NDArray[np.float32]:

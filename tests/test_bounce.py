@@ -146,4 +146,5 @@ def test_shadows_are_traced_once_for_a_light_and_of_patches_that_send_alone(monk
     for some in ([2], [0, 2], [3, 1, 0], [0, 1, 2, 3]):
         lit = lit_by(of, lights[some])
         assert np.array_equal(lit[of.sending], wanted[of.sending][:, some]) and not lit[quiet].any()
+    assert lit_by(of, lights[:0]).shape == (len(of.normal), 0)
     assert traced == [1, 1, 2] and wanted[of.sending].any() and not wanted[of.sending].all()
