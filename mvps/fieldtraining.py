@@ -56,7 +56,7 @@ class TrainingSettings:
     strides: every so many pixels take part, one after the other
     """
 
-    steps: int = 180
+    steps: int = 250
     rays: int = 1024
     ring_rays: int = 512
     samples: int = 6

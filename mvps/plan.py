@@ -65,9 +65,8 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True, detail=final)
 
 
-COARSE = RoundSettings(2.0, 2.4, 0.4, fusions=2, still=STILL_PIXELS, carving=True)
-"""A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows. A round that is done again sees anew what its
-fusions moved: two of them leave surfaces where three do (docs/findings/stage_one.md)."""
+COARSE = RoundSettings(2.0, 2.4, 0.4, still=STILL_PIXELS, carving=True)
+"""A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""
 
 
 def carving_pass(free_lights: bool) -> RefineSettings:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,6 @@ from sphere_scene import RADIUS, SphereScene, make_sphere
 from mvps.camera import pixel_footprint
 from mvps.joint import refine as rounds
 from mvps.joint.refine import MOST_REPEATS, Refined, RefineSettings, RoundSettings, refine
-from mvps.material import Model
 from mvps.photometric import normal_maps
 from mvps.scene import Law, Surface
 
@@ -84,7 +81,7 @@ def test_of_a_model_that_does_not_fit_no_round_is_done_again(scene: SphereScene,
 
 
 def test_vertices_that_have_far_to_go_have_not_settled(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=0.01, fusions=1),), free_lights=False)
+    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=0.01),), free_lights=False)
     first, second = refined_from(scene, 0.5, plan).rounds
     # One round says nothing of the next.
     assert first["left_px"] == 0 < second["left_px"]
@@ -94,37 +91,3 @@ def test_vertices_that_have_far_to_go_have_not_settled(scene: SphereScene, monke
         told.append(refined_from(scene, 0.5, plan))
     assert told[0].status == "not settled" and "px to go in the mean" in told[0].text
     assert "px to go in the mean" not in told[1].text
-
-
-def swollen_with_lights(scene: SphereScene, final: bool) -> Refined:
-    """From half a pixel too large, its rounds done again while vertices move a little."""
-    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4, still=0.02),), final=final, model=Model((8.0,)))
-    return refined_from(scene, 0.5, plan)
-
-
-@pytest.mark.parametrize("final", [False, True])
-def test_lights_stay_in_a_round_that_is_done_again_on_the_way(scene: SphereScene, final: bool) -> None:
-    refined = swollen_with_lights(scene, final)
-    assert len(refined.rounds) > 1
-    turned = [one["light_change_deg"] for one in refined.rounds]
-    assert turned[0] > 0 and all((one > 0) == final for one in turned[1:])
-    if not final:
-        first = refined_from(scene, 0.5, RefineSettings((RoundSettings(3.0, REACH, 0.4),), model=Model((8.0,))))
-        assert all(np.array_equal(a, b) for a, b in zip(first.lights.direction, refined.lights.direction, strict=True))
-        assert all(np.array_equal(a, b) for a, b in zip(first.lights.intensity, refined.lights.intensity, strict=True))
-
-
-def test_a_pass_goes_on_with_the_mesh_of_the_one_before_where_its_edges_are_wanted(scene: SphereScene) -> None:
-    device, plan = torch.device("cpu"), RefineSettings((RoundSettings(3.0, REACH, 0.4),), free_lights=False)
-    first = refined_from(scene, 0.5, plan)
-    assert first.carried is not None
-
-    def faces(edge: float, carried: bool) -> np.ndarray:
-        rounds = (RoundSettings(edge, REACH, 0.4),)
-        of = first.lights, first.maps, first.law, replace(plan, rounds=rounds), 0, device, lambda *_: None
-        return refine(scene.capture, first.surface, *of, first.carried if carried else None).surface.faces
-
-    assert np.array_equal(faces(3.0, True), first.surface.faces)
-    # Another surface's vertices, or other edges.
-    assert not np.array_equal(faces(3.0, False), first.surface.faces)
-    assert len(faces(4.5, True)) < 0.6 * len(first.surface.faces)

@@ -22,7 +22,7 @@ from mvps.joint.fused import vertex_maps
 from mvps.joint.grey import grey_lights, tensor32
 from mvps.joint.lighting import LIGHT_TIE, LIGHT_VERTICES, solved_lights, with_bounce, with_colours
 from mvps.joint.observe import ViewSamples, observe
-from mvps.joint.patches import Patches, drawn_patches
+from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.state import State, grey_albedo, lit_by, material_of, relative_residuals, senders_of
 from mvps.joint.steps import free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
@@ -40,7 +40,7 @@ WEAK_TIE = 0.3
 class Task:
     """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; sharpen: and solve the lobes'
     sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device:
-    of the tensors; vertices_alone: lights stay, and what of the law is solved with them."""
+    of the tensors."""
 
     free_lights: bool
     choose: bool
@@ -48,7 +48,6 @@ class Task:
     thinned: bool
     half: bool
     device: torch.device
-    vertices_alone: bool = False
 
 
 def _started(
@@ -86,20 +85,12 @@ def _lit(state: State, capture: Capture, few: list[ViewSamples], part: tuple[Cap
     return state.views if part[0] is capture else lit_by(state, few, capture, state.lights, sent)
 
 
-def _of_patches(state: State, capture: Capture, patches: Patches, device: torch.device) -> list[ViewSamples]:
-    """The capture's samples on the vertices of some patches."""
-    among = np.zeros(len(state.surface.vertices), bool)
-    among[patches.vertex.cpu().numpy()] = True
-    return observe(capture, state.surface, state.lights, device, among, state.law.shadows)
-
-
 def photometric_round(
     state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
 ) -> dict[str, float]:
-    """Vertices, lights, under all photographs, and the views' photometric stereo on the state's mesh; what changed."""
+    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
     device = task.device
     part, part_lights = thinned(capture, state.lights)
-    whole = part if task.vertices_alone else capture
     state.gathers = {}
     state.views = observe(part, state.surface, part_lights, device, shadows=state.law.shadows)
     mesh_normal = vertex_normals(state.surface)
@@ -111,13 +102,17 @@ def photometric_round(
             " nearer, and check masks and poses"
         )
     patches = drawn_patches(seen, state.surface, mesh_normal, LIGHT_VERTICES, generator, device)
-    few = state.views if part is whole else _of_patches(state, whole, patches, device)
+    few = state.views
+    if part is not capture:
+        among = np.zeros(len(mesh_normal), bool)
+        among[patches.vertex.cpu().numpy()] = True
+        few = observe(capture, state.surface, state.lights, device, among, state.law.shadows)
     choosing = task.choose and not state.trials
     if choosing:
         vertices = of_chosen_model(state, capture, few, vertices, mesh_normal, patches, task.sharpen)
     free = free_reflectance(tensor32(mesh_normal, device), WEAK_TIE, 1 + len(state.law.sharpness))
     before, lights = vertices.normal, grey_lights(part_lights, device)
-    relit = partial(_lit, state, whole, few, (part, part_lights))
+    relit = partial(_lit, state, capture, few, (part, part_lights))
     # Albedo that is solved as if nothing arrived from other surfaces is too large, and so is what it sends.
     if carried is not None:
         few = relit(vertices)
@@ -133,9 +128,7 @@ def photometric_round(
         few = relit(vertices)
         vertices, unknown = with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
-    solved, light_step = state.lights, 0.0
-    if not task.vertices_alone:
-        solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
+    solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
     moved = _light_change(state.lights, solved)
     state.lights = solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
@@ -143,8 +136,7 @@ def photometric_round(
     last = vertices.normal
     vertices = vertex_step(state.views, vertices, lights, state.law, free)
     state.vertices = vertices
-    if not task.vertices_alone:
-        state.lights = with_colours(state, capture, few, patches.vertex)
+    state.lights = with_colours(state, capture, few, patches.vertex)
     state.under = thinned(capture, state.lights)
     of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))

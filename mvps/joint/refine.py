@@ -39,7 +39,7 @@ from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
 from mvps.memory import room_for, solved_together
-from mvps.mesh import edges, isotropic_remesh, mean_edge_length, split_edges, unbiased, vertex_normals
+from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.noise import dark_noise_share, samples_noise
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
 from mvps.silhouette import mask_distances
@@ -69,9 +69,6 @@ MOST_REPEATS = 2
 MOST_ONWARD = 1
 """The same where vertices have farther to go: a second round takes them there, and after more of them photographs over hollows that only
 digging reaches fit well enough for these not to be found (docs/findings/stage_one.md)."""
-
-SAME_EDGES = 0.1
-"""Of the mean edge over the wanted one: meshes come out within 3 % of it, and what rounds want differs by half and more."""
 
 
 @dataclass(frozen=True)
@@ -194,20 +191,6 @@ def _moved(
     return Moved(closed_over(unbiased(surface), seen, capture, distance), place, agreed.sigma)
 
 
-def _is_meshed(surface: Surface, edge: float, carried: tuple[Surface, Vertices] | None) -> bool:
-    """Whether the surface is the mesh that an earlier pass ended with, and has such edges."""
-    same = carried is not None and np.array_equal(carried[0].faces, surface.faces)
-    return same and abs(mean_edge_length(surface) / edge - 1) < SAME_EDGES
-
-
-def _task(settings: RefineSettings, state: State, again: bool, last: bool, device: torch.device) -> Task:
-    """Of a round that is done again or not, and is the last or not."""
-    # What a round that is done again on the way moves vertices by hardly turns lights, and rounds to come solve them.
-    alone = again and not settings.final and not state.lobed
-    every_light = settings.in_full and last
-    return Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device, alone)
-
-
 def _remeshed(
     surface: Surface, settings: RoundSettings, before: RoundSettings | None, carried: tuple[Surface, Vertices] | None, pixel: float
 ) -> tuple[Surface, float]:
@@ -254,8 +237,7 @@ def refine(
     together = solved_together(lights) if settings.free_lights else 0
     state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), lobed=law.gleam > 0, together=together)
     account: list[dict[str, float]] = []
-    pending = list(settings.rounds)
-    before = pending[0] if _is_meshed(surface, pending[0].edge * pixel, carried) else None
+    before, pending = None, list(settings.rounds)
     last: Moves | float = settings.goes_on
     repeats = 0
     while pending:
@@ -268,7 +250,8 @@ def refine(
         mesh_normal = vertex_normals(state.surface)
         leaves_surface = (settings.for_field and not pending) or not round_settings.fusions
         if round_settings.photometric:
-            task = _task(settings, state, isinstance(last, Moves), not pending, device)
+            every_light = settings.in_full and not pending
+            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device)
             changes = photometric_round(state, capture, task, carried, generator)
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
