@@ -167,8 +167,8 @@ def _shadows(of: Gather, direction: Float) -> Bool:
     lights = [one.tobytes() for one in direction]
     new = [k for k, light in enumerate(lights) if light not in of.shadow]
     if new:
-        bits = np.packbits(cast_shadow(of.caster, of.vertex[of.sending], direction[new]), axis=0)
-        of.shadow.update((lights[k], bits[:, column]) for column, k in enumerate(new))
+        traced = np.packbits(cast_shadow(of.caster, of.vertex[of.sending], direction[new]), axis=0)
+        of.shadow.update((lights[k], traced[:, column]) for column, k in enumerate(new))
     bits = np.empty((-(-len(of.sending) // 8), len(lights)), np.uint8)
     for column, light in enumerate(lights):
         bits[:, column] = of.shadow[light]

@@ -117,6 +117,15 @@ def test_nothing_to_dig_leaves_the_solid(left: float, walls: bool) -> None:
     assert np.array_equal(dug(surface, np.full(len(surface.vertices), left), around(surface), walls=walls).values, as_it_is.values)
 
 
+def with_surface(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Digging and Stage I make this surface, in no time."""
+    monkeypatch.setattr("mvps.digging.stage_one", lambda *_: surface)
+    monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    monkeypatch.setattr("mvps.hollows.dug", lambda *_, **__: None)
+    monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
+    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: surface)
+
+
 @pytest.mark.parametrize(
     ("left", "made", "kept"),
     [
@@ -144,7 +153,6 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
         unexplained = np.where(bad, next(values), 0.0)
         return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), carried=None, rounds=[{"number": float(next(counted))}])
 
-    monkeypatch.setattr("mvps.digging.stage_one", lambda *_: wide)
     repeated: dict[str, set[bool]] = {}
 
     def stage_two(name: str, *given: Any) -> Any:
@@ -152,10 +160,7 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
         return refined()
 
     monkeypatch.setattr("mvps.digging.stage_two", stage_two)
-    monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    monkeypatch.setattr("mvps.hollows.dug", lambda *_, **__: None)
-    monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
-    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
+    with_surface(wide, monkeypatch)
     found = refined()
     best, rounds = hollowed(capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
     assert next(counted) - 2 == made and len(rounds) == kept
@@ -178,12 +183,8 @@ def test_after_a_dig_less_may_be_hidden(depths: tuple[float, ...], made: int, mo
 
     monkeypatch.setattr("mvps.camera.surface_pixel", lambda *_: 1.0)
     monkeypatch.setattr("mvps.hollows.hidden", lambda *_: next(told))
-    monkeypatch.setattr("mvps.digging.stage_one", lambda *_: surface)
     monkeypatch.setattr("mvps.digging.stage_two", refined)
-    monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
-    monkeypatch.setattr("mvps.hollows.dug", lambda *_, **__: None)
-    monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
-    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: surface)
+    with_surface(surface, monkeypatch)
     found = refined()
     _, rounds = hollowed(make_sphere(3).capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
     assert len(rounds) == made and next(told, None) is None

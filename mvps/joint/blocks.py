@@ -250,10 +250,11 @@ def _grazing(cosine: Tensor) -> tuple[Tensor, Tensor]:
 
 def vertex_derivatives(shaded: Shaded, frame: tuple[Tensor, Tensor], towards: Tensor, lights: DirectionalLights) -> list[Tensor]:
     """3 + lobes derivatives (..., n, lights) of the samples by two tangential steps of the normal, the albedo and the weights."""
+    # In place: arrays of a batch fill the processor's cache, and new ones push out what is still needed.
     q = shaded.n_dot_l * lights.intensity
     along_half = (q * shaded.slope).div_(shaded.c)
     along_light = (shaded.lit * lights.intensity).mul_(shaded.reflectance).add_(along_half).add_(q * shaded.of_light)
-    along_view = along_half.add_(q.mul_(shaded.of_view))
+    along_view = (q * shaded.of_view).add_(along_half)
     columns = [(t @ lights.direction.mT).mul_(along_light).add_(along_view * (t * towards).sum(-1, keepdim=True)) for t in frame]
     return columns + shaded.basis
 

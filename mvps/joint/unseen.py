@@ -95,25 +95,23 @@ def _back_behind(caster: RayCaster, free: Int, capture: Capture, front: _Fronts)
     moved a pixel behind it where they are least in front."""
     points, normal = caster.surface.vertices[free], caster.vertex_normals[free]
     least, moved = np.full(len(points), np.inf), points.copy()
-    caster_of_front = front.caster
-    if caster_of_front is None:
+    ahead = front.caster
+    if ahead is None:
         return np.zeros(len(points), bool), moved
 
-    def in_front(view: View, faces: Bool) -> tuple[Int, Float]:
-        """Which points show the view their back, and how far before a face (faces,) that it sees."""
+    def in_front(view: View, faces: Bool) -> tuple[Int, Float, Float]:
+        """Which points show the view their back, how far before a face (faces,) that it sees, and a pixel behind that."""
         away = -view_directions(view.camera, points)
         chosen = np.flatnonzero((normal * away).sum(1) > 0)
         chosen = chosen[~caster.occluded(points[chosen] - caster.offset * away[chosen], -away[chosen])]
-        hits = caster_of_front.first_hits(points[chosen], away[chosen])
+        hits = ahead.first_hits(points[chosen], away[chosen])
         before = (hits.face >= 0) & faces[hits.face]
-        return chosen[before], hits.distance[before]
+        chosen, depth = chosen[before], hits.distance[before]
+        return chosen, depth, points[chosen] + (depth + footprint(view.camera, points[chosen]))[:, None] * away[chosen]
 
-    for view, (chosen, depth) in zip(capture.views, on_cores(in_front, capture.views, front.seen), strict=True):
+    for chosen, depth, behind in on_cores(in_front, capture.views, front.seen):
         nearer = depth < least[chosen]
-        chosen, depth = chosen[nearer], depth[nearer]
-        least[chosen] = depth
-        away = -view_directions(view.camera, points[chosen])
-        moved[chosen] = points[chosen] + (depth + footprint(view.camera, points[chosen]))[:, None] * away
+        least[chosen[nearer]], moved[chosen[nearer]] = depth[nearer], behind[nearer]
     found: Bool = np.isfinite(least)
     return found, moved
 
