@@ -9,23 +9,30 @@ nine homogeneous linear equations in A whose null vector, the smallest eigenvect
 sum_p rho(|A b'_p / |A b'_p| - n_p|). rho redescends and its scale shrinks (graduated non-convexity, Blake and Zisserman 1987), because
 a hull's normals are exact near the silhouettes and far off in concavities.
 
-Where the lights stand still in the camera's frame (one rig), all pixels of all views are factorised together in camera frames.
-That is decided by the data: pooled, the variance that the factors leave must not double against separate factorisations. Of a view that
-shows three flat sides three factors explain anything, and its normals fix no A: from most views so, one rig is believed. A is fixed where
-the second eigenvalue of the 9 x 9 matrix over its inliers, at the solved A, is above what the last scale of rho lets pass; where it is not,
-albedo a_p and s_l are solved in turn in I_pl = a_p n_p . s_l.
+Where all views are under the same lights (one rig), all pixels of all views are factorised together. That is decided by the data: pooled,
+the variance that the factors leave must not double against separate factorisations. Of a view that shows three flat sides three factors
+explain anything, and its normals fix no A: from most views so, one rig is believed. A is fixed where the second eigenvalue of the 9 x 9
+matrix over its inliers, at the solved A, is above what the last scale of rho lets pass; where it is not, albedo a_p and s_l are solved in
+turn in
+
+    I_pl = a_p (n_p . s_l)+     for the rough shape's normals as they are.
+
+Factors know no frame. Whether a rig stands still with the camera or in the world, while the camera moves, is told by which of the two
+leaves less under the rough shape's normals and one albedo at every vertex (sharing.py). Nor do factors find lights that most pixels of a
+view turn away from (of lamps all around, half are behind the object), for what is not lit counts as missing. So a rig that so explains the
+views is believed too. Its lights, and those of one that stands still in the world, are the ones of the equation above.
 
 Metals have no diffuse body, and the factors say nothing: where highlights explain the images better than Lambert's law does, the lights
 are those by correlation (correlation.py).
 
 Views with fewer than MINIMUM_LIGHTS lights cannot be factorised; there the lights are the least-squares solution of I_pl = n_p . s_l
-for the rough shape's normals, one albedo for the whole object (other albedos are outliers).
+for the rough shape's normals, one albedo for the whole object (other albedos are outliers), of all views together where they share lights.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +40,8 @@ from numpy.typing import NDArray
 from mvps.cores import on_cores
 from mvps.correlation import glossy_lights, is_glossy
 from mvps.mesh import normalise, vertex_normals
-from mvps.scene import Bool, Camera, Capture, CaptureError, Float, Lights, Surface, View
+from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface, View
+from mvps.sharing import Frame, shared_frame
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
 
@@ -51,7 +59,7 @@ BRIGHT_QUANTILE = 0.8
 """A pixel's bright level: above its shadows, below its highlights."""
 
 POOLED_VARIANCE_RATIO = 2.0
-"""One rig is believed while pooling the views adds less variance than the factors of single views leave."""
+"""One rig is believed while pooling the views adds less variance than single views leave."""
 
 ROUGH_NORMAL, FINE_NORMAL = 0.3, 0.05
 """Scale of the robust angle, radians, from first to last sweep: the error of a visual hull's normals where it bulges over a concavity,
@@ -66,9 +74,9 @@ class Calibration:
 
     residual: relative RMS that three factors leave; fourth_singular_value: over the first one. Both are 0.05 to 0.15 on matte and glossy
     objects, above 0.25 where there is no diffuse body, and NaN where there are too few lights to factorise. metallic: the lights are those
-    by correlation (correlation.py), and photometric stereo by Lambert's law would say nothing. assumed: one rig was believed because single
-    views tell nothing of their lights; under_normals: of some or all lights the rough shape's normals did not fix the ambiguity, so that
-    these are the lights under the normals as they are.
+    by correlation (correlation.py), and photometric stereo by Lambert's law would say nothing.
+    assumed: one rig was believed because single views tell nothing of their lights; under_normals: of some or all lights the rough shape's
+    normals did not fix the ambiguity, or factors were not believed, so that these are the lights under the normals as they are.
     """
 
     lights: Lights
@@ -81,6 +89,7 @@ class Calibration:
     def words(self) -> str:
         """How the lights were found."""
         kind = "one rig for all views" if self.lights.one_rig else "lights of every view on their own"
+        kind += ", which stands still while the camera moves" if self.lights.fixed else ""
         if math.isnan(self.residual):
             return f"{kind}, from the rough shape's normals"
         kind += ", which do not tell them one by one" if self.assumed else ""
@@ -121,6 +130,19 @@ def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.
     known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
     seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
     return _Sampled(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)))
+
+
+def _pooled(samples: list[_Sampled]) -> _Sampled:
+    """The pixels of all views as if they were one's."""
+    image, bright, known, normal = (np.concatenate([getattr(s, name) for s in samples]) for name in ("image", "bright", "known", "normal"))
+    return _Sampled(image, bright, known, normal, float(np.median([s.noise for s in samples])))
+
+
+def _in_frame(samples: list[_Sampled], capture: Capture, frame: Frame) -> list[_Sampled]:
+    """The samples with normals in this frame."""
+    if frame == "camera":
+        return samples
+    return [replace(s, normal=s.normal @ view.camera.rotation) for s, view in zip(samples, capture.views, strict=True)]
 
 
 def _gram(pseudo: Float, normal: Float, weight: Float) -> Float:
@@ -200,12 +222,14 @@ def _mostly_fixed(separate: list[Factorisation], samples: list[_Sampled]) -> boo
     return 2 * sum(A is not None for A in on_cores(lambda f, s: _ambiguity(f, [s]), separate, samples)) > len(samples)
 
 
-def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> tuple[Float, bool]:
-    """(lights, 3) intensity times direction in the frame of the samples' normals, and whether these did not fix the ambiguity."""
-    A = _ambiguity(factors, samples)
-    albedo, lights = (
-        _under_normals(samples) if A is None else (np.linalg.norm(factors.left @ A.T, axis=1), factors.right @ np.linalg.inv(A))
-    )
+def _scaled_lights(factors: Factorisation | None, samples: list[_Sampled]) -> tuple[Float, bool]:
+    """(lights, 3) intensity times direction in the frame of the samples' normals, and whether these did not fix the ambiguity, or there
+    are no factors."""
+    A = None if factors is None else _ambiguity(factors, samples)
+    if factors is None or A is None:
+        albedo, lights = _under_normals(samples)
+    else:
+        albedo, lights = np.linalg.norm(factors.left @ A.T, axis=1), factors.right @ np.linalg.inv(A)
     # The median albedo is the unit, so that lights of separately solved views share one scale.
     scaled: Float = lights * np.median(albedo * np.concatenate([s.bright for s in samples]))
     return without_gaps(scaled), A is None
@@ -213,8 +237,11 @@ def _scaled_lights(factors: Factorisation, samples: list[_Sampled]) -> tuple[Flo
 
 def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
     """Albedo (n,) over the pixels' bright levels and lights (lights, 3) in turn, for the rough shape's normals as they are."""
-    image, known, normal = (np.concatenate([getattr(s, name) for s in samples]) for name in ("image", "known", "normal"))
-    noise = float(np.median([s.noise for s in samples]))
+    of = _pooled(samples)
+    # Where fewer lights than the brightest fifth reach a pixel its bright level is none, and what does would outweigh all else.
+    level = np.sqrt((of.known * of.image**2).sum(1) / np.maximum(of.known.sum(1), 1))
+    level = np.where(level > 0, level, 1.0)
+    image, known, normal, noise = of.image / level[:, None], of.known, of.normal, of.noise
     if np.linalg.eigvalsh(normal.T @ normal)[0] < FINE_NORMAL**2 * len(normal):
         raise CaptureError(
             "lights: wanted a rough shape whose normals point many ways, given one where they all lie in one plane; use more views or"
@@ -228,7 +255,7 @@ def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
         albedo = (weight * image * shading).sum(1) / np.maximum((weight * shading**2).sum(1), np.finfo(float).tiny)
         weight = robust_weights((image - albedo[:, None] * shading).T, lit.T, noise)
         lights = solve_rows(image.T, weight, albedo[:, None] * normal)
-    return albedo, lights
+    return albedo * level, lights
 
 
 def without_gaps(scaled: Float) -> Float:
@@ -267,15 +294,10 @@ def colour_ratios(view: View) -> Float:
     return of_mean_one
 
 
-def normalised(directions: list[Float], intensities: list[Float], one_rig: bool) -> Lights:
+def normalised(directions: list[Float], intensities: list[Float], one_rig: bool, fixed: bool = False) -> Lights:
     """Lights with intensities scaled to a mean of one over all lights and channels."""
     mean = float(np.mean(np.concatenate(intensities)))
-    return Lights(tuple(directions), tuple(e / mean for e in intensities), one_rig)
-
-
-def _to_world(scaled: Float, camera: Camera, ratio: Float) -> tuple[Float, Float]:
-    length = np.linalg.norm(scaled, axis=1, keepdims=True)
-    return scaled / length @ camera.rotation, length * ratio
+    return Lights(tuple(directions), tuple(e / mean for e in intensities), one_rig, fixed)
 
 
 def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share: bool = True) -> Calibration:
@@ -285,32 +307,59 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
     caster, normal = ray_caster(surface), vertex_normals(surface)
     samples = [_sampled(view, caster, normal, generator) for view in capture.views]
     counts = {len(view.lights) for view in capture.views}
+    may_share &= len(capture.views) > 1 and len({view.lights for view in capture.views}) == 1
     if min(counts) < MINIMUM_LIGHTS:
-        scaled = [_from_normals(sample) for sample in samples]
-        return Calibration(_assemble(capture, scaled, False), float("nan"), float("nan"))
+        frame = shared_frame(capture, caster, np.random.default_rng(seed)) if may_share else None
+        if frame is not None:
+            rig = _from_normals(_pooled(_in_frame(samples, capture, frame)))
+            lights = _assemble(capture, [rig] * len(samples), True, frame == "world")
+        else:
+            lights = _assemble(capture, [_from_normals(sample) for sample in samples], False)
+        return Calibration(lights, float("nan"), float("nan"))
     separate = on_cores(lambda s: factorise(s.image, s.known, 3, floor=s.noise), samples)
     residual = float(np.sqrt(np.mean([f.residual**2 for f in separate])))
     fourth = float(np.mean([f.singular_values[3] for f in separate]))
-    if may_share and len(capture.views) > 1 and len(counts) == 1 and len({view.lights for view in capture.views}) == 1:
-        together = factorise(
-            np.concatenate([s.image for s in samples]),
-            np.concatenate([s.known for s in samples]),
-            3,
-            floor=float(np.median([s.noise for s in samples])),
-        )
-        alike = together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
-        if alike or not _mostly_fixed(separate, samples):
-            image, seen = (np.concatenate(parts) for parts in zip(*((s.absolute, s.normal) for s in samples), strict=True))
-            metallic = is_glossy([image], [seen], generator)
-            rig, left_open = (glossy_lights(image, seen), False) if metallic else _scaled_lights(together, samples)
-            lights = _assemble(capture, [rig] * len(samples), True)
-            return Calibration(lights, together.residual, float(together.singular_values[3]), metallic, not alike, left_open)
+    if may_share:
+        found = _one_rig(capture, caster, samples, separate, residual, generator, seed)
+        if found is not None:
+            return found
     if is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator):
         scaled = [glossy_lights(s.absolute, s.normal) for s in samples]
         return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
     each = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
     left_open = any(is_open for _, is_open in each)
     return Calibration(_assemble(capture, [scaled for scaled, _ in each], False), residual, fourth, under_normals=left_open)
+
+
+def _one_rig(
+    capture: Capture,
+    caster: RayCaster,
+    samples: list[_Sampled],
+    separate: list[Factorisation],
+    residual: float,
+    generator: np.random.Generator,
+    seed: int,
+) -> Calibration | None:
+    """Lights that all views share, None where they share none; residual: what separate factors leave."""
+    pooled = _pooled(samples)
+    together = factorise(pooled.image, pooled.known, 3, floor=pooled.noise)
+    alike = together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
+    frame = shared_frame(capture, caster, np.random.default_rng(seed))
+    flat = not alike and frame is None and not _mostly_fixed(separate, samples)
+    if not (alike or frame or flat):
+        return None
+    fixed = frame == "world"
+    metallic = is_glossy([pooled.absolute], [pooled.normal], generator)
+    if metallic and (fixed or not (alike or flat)):
+        # Highlights hang on where the camera is, and hide what normals tell.
+        return None
+    if metallic:
+        rig, left_open = glossy_lights(pooled.absolute, pooled.normal), False
+    else:
+        factors = together if (alike or flat) and not fixed else None
+        rig, left_open = _scaled_lights(factors, _in_frame(samples, capture, frame or "camera"))
+    lights = _assemble(capture, [rig] * len(samples), True, fixed)
+    return Calibration(lights, together.residual, float(together.singular_values[3]), metallic, flat, left_open)
 
 
 def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
@@ -321,10 +370,13 @@ def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
     return is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator)
 
 
-def _assemble(capture: Capture, scaled: list[Float], one_rig: bool) -> Lights:
+def _assemble(capture: Capture, scaled: list[Float], one_rig: bool, fixed: bool = False) -> Lights:
+    """Lights of intensity times direction (lights, 3) of every view, in the cameras' frames; fixed: in the world's."""
     ratios = on_cores(colour_ratios, capture.views)
     if one_rig:
         mean = np.mean(ratios, axis=0)
         ratios = [mean] * len(ratios)
-    pairs = [_to_world(s, view.camera, r) for s, view, r in zip(scaled, capture.views, ratios, strict=True)]
-    return normalised([d for d, _ in pairs], [e for _, e in pairs], one_rig)
+    lengths = [np.linalg.norm(s, axis=1, keepdims=True) for s in scaled]
+    unit = [s / length for s, length in zip(scaled, lengths, strict=True)]
+    directions = unit if fixed else [d @ view.camera.rotation for d, view in zip(unit, capture.views, strict=True)]
+    return normalised(directions, [length * r for length, r in zip(lengths, ratios, strict=True)], one_rig, fixed)

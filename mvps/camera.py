@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.mesh import normalise
-from mvps.scene import Bool, Camera, Capture, Float, Int, Surface
+from mvps.scene import Bool, Camera, Capture, Float, Int, Lights, Surface
 
 DILIGENT_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 """Axes of DiLiGenT's lights and normals (x right, y up, z towards the camera) from OpenCV camera axes; its own inverse."""
@@ -59,6 +59,11 @@ def pixel_footprint(cameras: list[Camera], point: Float) -> float:
 def surface_pixel(capture: Capture, surface: Surface) -> float:
     """What a pixel covers at the surface, world units."""
     return pixel_footprint([view.camera for view in capture.views], surface.vertices.mean(0))
+
+
+def rig_frame(lights: Lights, camera: Camera) -> Float:
+    """(3, 3) rotation from the world to the frame in which a rig of lights stands still; the camera's where there is no rig."""
+    return np.eye(3) if lights.fixed else camera.rotation
 
 
 def inside_image(camera: Camera, image: Float) -> Bool:

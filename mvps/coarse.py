@@ -41,11 +41,11 @@ long as the residual falls."""
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
     from mvps.camera import surface_pixel
-    from mvps.hull import default_cells, signed_distance, visual_hull
+    from mvps.hull import default_cells, pieces, signed_distance, visual_hull
 
     with progress.stage("visual hull") as stage:
         grid = signed_distance(capture, default_cells(capture))
-        surface = visual_hull(grid)
+        surface = visual_hull(grid, pieces(capture, grid))
         pixel = surface_pixel(capture, surface)
         stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing / pixel:.2g} pixels")
     return grid, surface
@@ -107,12 +107,13 @@ def in_turn(
     """
     from mvps.device import chosen_device
     from mvps.material import POOR_FIT
+    from mvps.mesh import piece_count
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
 
     plan, refined, carried = OccupancySettings(), rough, None
     rounds: list[dict[str, float]] = []
     residual = rough.rounds[-1]["residual"]
-    field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device))
+    field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device), piece_count(rough.surface))
     surface = stage_one(field, rough.maps, plan, progress, words)
     for turn in range(MOST_TURNS):
         if turn:

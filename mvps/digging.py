@@ -59,6 +59,7 @@ def hollowed(
     from mvps.device import chosen_device
     from mvps.hollows import beyond_noise, dug, hidden, solid
     from mvps.hull import visual_hull
+    from mvps.mesh import piece_count
     from mvps.occupancy import CONTINUED, Occupancy
     from mvps.plan import once
 
@@ -73,19 +74,19 @@ def hollowed(
     def better(after: Refined, before: Refined, share: float = 1.0) -> bool:
         return bool(np.nanmean(unexplained(after)) < share * np.nanmean(unexplained(before)))
 
-    best, rounds = found, list[dict[str, float]]()
+    best, rounds, count = found, list[dict[str, float]](), piece_count(found.surface)
     for depth in DEPTHS:
         for _ in range(MOST_TURNS):
             if not worth_digging(best):
                 return best, rounds
             trial, taken = best, []
             for _ in range(MOST_TURNS):
-                before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth, walls=True))
+                before, surface = trial, visual_hull(dug(trial.surface, unexplained(trial), grid, depth, walls=True), count)
                 trial = stage_two("hollows", capture, surface, before, once(of_turn), settings, progress)
                 taken += trial.rounds
                 if not (better(trial, before) and worth_digging(trial)):
                     break
-            field = Occupancy(capture, solid(trial.surface, grid), CONTINUED, settings.seed, chosen_device(settings.device))
+            field = Occupancy(capture, solid(trial.surface, grid), CONTINUED, settings.seed, chosen_device(settings.device), count)
             surface = stage_one(field, trial.maps, CONTINUED, progress)
             trial = stage_two("coarse refinement", capture, surface, trial, of_turn, settings, progress)
             if not better(trial, best, WORTHWHILE):
@@ -103,6 +104,7 @@ def pitted(
     from mvps.camera import surface_pixel
     from mvps.hollows import beyond_noise, dug, mean_depth, misfit, pits
     from mvps.hull import visual_hull
+    from mvps.mesh import piece_count
     from mvps.plan import once
 
     noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
@@ -115,7 +117,7 @@ def pitted(
         # Ground that was dug is a cell away from the balls at most.
         balls = best.surface.vertices[depth > 0], depth[depth > 0] + grid.spacing
         before = misfit(best.surface, left, *balls)
-        trial, taken, surface = best, list[dict[str, float]](), visual_hull(dug(best.surface, left, grid))
+        trial, taken, surface = best, list[dict[str, float]](), visual_hull(dug(best.surface, left, grid), piece_count(best.surface))
         for worth_another in (np.sqrt(HALVED), HALVED):
             trial = stage_two("pits", capture, surface, trial, plan, settings, progress, trial.carried if taken else None)
             after, surface, taken = beyond_noise(trial.unexplained, noise), trial.surface, taken + trial.rounds

@@ -101,13 +101,16 @@ def read_reconstruction(folder: Path) -> Reconstruction:
             of_all = {name: kind(arrays[name]) for name, kind in _OF_ALL.items() if name in arrays or name != "gleam"}
             values = {name: arrays[name] for name in _MATERIAL} | of_all
             material = Material(normal=mesh.normals, **values, residual=_residual(arrays))
+        # Results of before there were fixed rigs have none.
+        fixed = bool(record.get("fixed", False))
         return Reconstruction(
             surface=Surface(mesh.vertices, mesh.faces),
             material=material,
             lights=Lights(
                 direction=tuple(_rows(record, view, "direction") for view in views),
                 intensity=tuple(_rows(record, view, "intensity") for view in views),
-                one_rig=bool(record["one_rig"]),
+                one_rig=bool(record["one_rig"]) or fixed,
+                fixed=fixed,
             ),
             views=views,
             light_names=tuple(_light_numbers(record["views"][view]["lights"]) for view in views),
@@ -192,7 +195,7 @@ def _lights_record(reconstruction: Reconstruction) -> dict[str, Any]:
         for view, numbers, direction, intensity in rows
     }
     # Not sorted by name: the order is that of the views.
-    return {"one_rig": lights.one_rig, "views": views}
+    return {"one_rig": lights.one_rig and not lights.fixed, "fixed": lights.fixed, "views": views}
 
 
 def _rows(record: dict[str, Any], view: str, name: str) -> Float:

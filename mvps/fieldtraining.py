@@ -23,7 +23,7 @@ from torch import Tensor
 from mvps.camera import pixel_footprint
 from mvps.field import Grid, OccupancyField, SampledField, covering, gradient
 from mvps.fieldrays import FieldRays, ring_rays, trace
-from mvps.mesh import largest_component
+from mvps.mesh import largest_pieces
 from mvps.scene import Capture, Float, SignedDistanceGrid, Surface
 from solvers.adam import Adam
 
@@ -272,12 +272,12 @@ class Training(ABC):
             rate = min(1.0, (k + 1) / 20) * 0.05 ** max(0.0, (progress - 0.3) / 0.7)
             on_step(k, self.step(Phase.at(progress, s), rate))
 
-    def surface(self, on_step: Callable[[int, Tensor], None]) -> Surface:
-        """The field's surface after all steps; world units. on_step(step from 0, loss) is called after every step."""
+    def surface(self, on_step: Callable[[int, Tensor], None], pieces: int = 1) -> Surface:
+        """The field's surface after all steps, so many pieces of it; world units. on_step(step from 0, loss) is called after every step."""
         torch.set_num_threads(1)
         with self.pool_of_threads:
             self.run(on_step)
-        return extract(self.field, self.frame, self.settings.voxel)
+        return extract(self.field, self.frame, self.settings.voxel, pieces)
 
 
 def hull_frame(capture: Capture, grid: SignedDistanceGrid, device: torch.device) -> Frame:
@@ -322,10 +322,10 @@ def sampled(field: OccupancyField, low: Tensor, high: Tensor, voxel: float) -> T
     return fine
 
 
-def extract(field: OccupancyField, frame: Frame, voxel: float) -> Surface:
-    """The field's zero level set on a grid of `voxel`, its largest component, faces outwards; world units."""
+def extract(field: OccupancyField, frame: Frame, voxel: float, pieces: int) -> Surface:
+    """The field's zero level set on a grid of `voxel`, its largest pieces, faces outwards; world units."""
     from skimage.measure import marching_cubes
 
     vertices, faces, _, _ = marching_cubes(sampled(field, frame.low, frame.high, voxel).cpu().numpy(), 0.0)
     local = frame.low.cpu().numpy().astype(np.float64) + voxel * vertices.astype(np.float64)
-    return largest_component(Surface(frame.centre + frame.unit * local, faces))
+    return largest_pieces(Surface(frame.centre + frame.unit * local, faces), pieces)

@@ -17,7 +17,7 @@ from skimage.measure import marching_cubes
 
 from mvps.camera import pixel_footprint, project
 from mvps.cores import on_cores
-from mvps.mesh import largest_component
+from mvps.mesh import largest_pieces, piece_count
 from mvps.scene import Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
 from mvps.silhouette import beyond_mask, mask_distances
 
@@ -26,6 +26,9 @@ MARGIN_CELLS = 3
 
 POINTS_PER_PART = 1 << 15
 """Points handled at once: their arrays stay in the processor's cache."""
+
+ALONE = 0.01
+"""Of the pixels of all masks, what a piece of the hull must be alone in covering: less are cells of noise."""
 
 MINIMUM_CELLS_ACROSS = 8
 """A hull thinner than this many coarse cells is no solid that masks could have made."""
@@ -133,14 +136,38 @@ def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
     return _sample(masks, low, high, cells)
 
 
-def visual_hull(grid: SignedDistanceGrid) -> Surface:
-    """The zero level set, largest component, faces outwards, world units."""
+def pieces(capture: Capture, grid: SignedDistanceGrid) -> int:
+    """Of how many pieces the hull is to be: the fewest of the largest such that no other piece is alone in covering a share ALONE of the
+    masks. What masks do not ask for are cells of noise, and ghosts where the cones of several parts meet."""
+    whole = _level_set(grid)
+    asked = int(sum(view.mask.sum() for view in capture.views))
+    for count in range(1, piece_count(whole)):
+        fewer, more = (covered(largest_pieces(whole, n), capture) for n in (count, count + 1))
+        if more - fewer < ALONE * asked:
+            return count
+    return max(piece_count(whole), 1)
+
+
+def covered(surface: Surface, capture: Capture) -> int:
+    """Pixels of masks that the surface covers, over all views."""
+    from mvps.visibility import camera_hits, ray_caster
+
+    caster = ray_caster(surface)
+    return sum(int((camera_hits(caster, view.camera, view.pixels).face >= 0).sum()) for view in capture.views)
+
+
+def visual_hull(grid: SignedDistanceGrid, pieces: int = 1) -> Surface:
+    """The zero level set, its largest pieces, faces outwards, world units."""
+    return largest_pieces(_level_set(grid), pieces)
+
+
+def _level_set(grid: SignedDistanceGrid) -> Surface:
     if not grid.values.min() < 0 < grid.values.max():
         raise CaptureError(
             "visual hull: wanted masks that agree on one object, given masks whose common part is empty; check masks and poses"
         )
     vertices, faces, _, _ = marching_cubes(np.array(grid.values), 0.0)
-    return largest_component(Surface(grid.origin + grid.spacing * vertices.astype(np.float64), faces))
+    return Surface(grid.origin + grid.spacing * vertices.astype(np.float64), faces)
 
 
 def default_cells(capture: Capture) -> int:

@@ -144,14 +144,25 @@ def without_unused_vertices(surface: Surface) -> Surface:
     return Surface(surface.vertices[used], inverse.reshape(-1, 3))
 
 
-def largest_component(surface: Surface) -> Surface:
-    """The connected component with the largest area."""
-    n = len(surface.vertices)
-    pairs = edges(surface)
+def _pieces(surface: Surface) -> tuple[Int, Int]:
+    """Of each face the number of its connected component, and these numbers from the largest area to the smallest."""
+    n, pairs = len(surface.vertices), edges(surface)
     graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
-    area = np.bincount(label[surface.faces[:, 0]], face_areas(surface))
-    return without_unused_vertices(Surface(surface.vertices, surface.faces[label[surface.faces[:, 0]] == area.argmax()]))
+    label = connected_components(graph, directed=False)[1][surface.faces[:, 0]]
+    area = np.bincount(label, face_areas(surface))
+    # Single vertices are components without faces.
+    return label, np.argsort(-area, kind="stable")[: len(np.unique(label))]
+
+
+def piece_count(surface: Surface) -> int:
+    """How many connected components the faces make."""
+    return len(_pieces(surface)[1])
+
+
+def largest_pieces(surface: Surface, count: int = 1) -> Surface:
+    """The `count` connected components with the largest areas."""
+    label, order = _pieces(surface)
+    return without_unused_vertices(Surface(surface.vertices, surface.faces[np.isin(label, order[:count])]))
 
 
 def split_edges(surface: Surface, marked: Bool) -> Surface:
@@ -192,7 +203,7 @@ def unbiased(surface: Surface) -> Surface:
 
 def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) -> Surface:
     """The surface with edges of about `edge_length` (split, collapse, flip, relax: Botsch and Kobbelt 2004). Edges across which
-    the surface turns by KNIFE_EDGE stay edges, and vertices on them stay there."""
+    the surface turns by KNIFE_EDGE stay edges, and vertices on them stay there. Of what falls apart as many pieces stay as there were."""
     from gpytoolbox import remesh_botsch
 
     vertices: Any
@@ -207,7 +218,7 @@ def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) 
             detect_feature_edges=True,
             feature_dihedral_threshold=KNIFE_EDGE,
         )
-    return largest_component(Surface(vertices, faces))
+    return largest_pieces(Surface(vertices, faces), piece_count(surface))
 
 
 LEAST_FACES = 4

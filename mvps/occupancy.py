@@ -81,12 +81,13 @@ class _Training(Training):
 
 
 class Occupancy:
-    """The field of a capture, started at its visual hull. Normal maps train it: once, and again when better ones are known."""
+    """The field of a capture, started at its visual hull, of so many pieces. Normal maps train it: once, and again when better ones are
+    known."""
 
     def __init__(
-        self, capture: Capture, hull_grid: SignedDistanceGrid, settings: OccupancySettings, seed: int, device: torch.device
+        self, capture: Capture, hull_grid: SignedDistanceGrid, settings: OccupancySettings, seed: int, device: torch.device, pieces: int = 1
     ) -> None:
-        self._capture, self._frame = capture, hull_frame(capture, hull_grid, device)
+        self._capture, self._frame, self._pieces = capture, hull_frame(capture, hull_grid, device), pieces
         start = field_grids(hull_grid, self._frame, settings)
         self._field = OccupancyField(*start, settings.features, settings.hidden, COLOURS, torch.Generator().manual_seed(seed))
         self._generator = torch.Generator(device).manual_seed(seed)
@@ -101,6 +102,6 @@ class Occupancy:
         data = foreground_rays(self._capture, normal_maps, frame.centre, frame.unit, frame.low.device)
         ring = silhouette_rays(self._capture, frame, settings)
         training = _Training(self._field, frame, data, ring, settings, self._generator, self._trained)
-        surface = training.surface(on_step)
+        surface = training.surface(on_step, self._pieces)
         self._trained = True
         return surface

@@ -29,9 +29,8 @@ def all_lights(
     for view, directions, intensities in zip(used.views, lights.direction, lights.intensity, strict=True):
         known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
     if held is not None and lights.one_rig:
-        rotations = [view.camera.rotation for view in used.views]
         for view in held.views:
-            directions, intensities = carried_over(lights, rotations, view.camera.rotation)
+            directions, intensities = carried_over(lights, used.views[0].camera, view.camera)
             rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
             known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
     if held is not None:
@@ -39,12 +38,12 @@ def all_lights(
         rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
         if rest is not None:
             shared = lights.one_rig and len({view.lights for view in rest.views}) == 1
-            fitted = fit_lights(rest, surface, material, shared, device)
+            fitted = fit_lights(rest, surface, material, shared, device, shared and lights.fixed)
             for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
                 known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
     direction = tuple(np.array([known[view.name, n][0] for n in view.lights]) for view in capture.views)
     intensity = tuple(np.array([known[view.name, n][1] for n in view.lights]) for view in capture.views)
-    return Lights(direction, intensity, lights.one_rig)
+    return replace(lights, direction=direction, intensity=intensity)
 
 
 def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[Any, ...]:

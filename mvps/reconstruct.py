@@ -210,7 +210,7 @@ def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
         rows = [reconstruction.light_names[at].index(n) for n in view.lights]
         directions.append(reconstruction.lights.direction[at][rows])
         intensities.append(reconstruction.lights.intensity[at][rows])
-    return Lights(tuple(directions), tuple(intensities), reconstruction.lights.one_rig)
+    return replace(reconstruction.lights, direction=tuple(directions), intensity=tuple(intensities))
 
 
 def load_libraries() -> None:

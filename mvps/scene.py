@@ -157,12 +157,15 @@ class Lights:
 
     direction  per view (lights, 3) unit, world frame, from the surface towards the light
     intensity  per view (lights, 3) RGB, positive, relative
-    one_rig    the lights stand still in the camera's frame: rotation_i @ direction_i is the same for all views i
+    one_rig    all views are under the same lights, which stand still in the camera's frame: rotation_i @ direction_i is the same for
+               all views i
+    fixed      one rig that stands still in the world instead, while the camera moves: direction_i is the same for all views i
     """
 
     direction: tuple[Float, ...]
     intensity: tuple[Float, ...]
     one_rig: bool
+    fixed: bool = False
 
     def __post_init__(self) -> None:
         if len(self.direction) != len(self.intensity):

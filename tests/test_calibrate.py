@@ -12,14 +12,15 @@ from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps import calibrate
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
-from mvps.hull import bounds, default_cells, signed_distance, visual_hull
-from mvps.mesh import normalise, vertex_normals
+from mvps.hull import bounds, default_cells, pieces, signed_distance, visual_hull
+from mvps.mesh import normalise, piece_count, vertex_normals
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
 from mvps.silhouette import mask_distance
 from mvps.synthetic.scene import Scene, make_cameras, make_lights, render_capture
 from mvps.synthetic.settings import SceneSettings
 from mvps.synthetic.shape import make_material
+from mvps.visibility import RayCaster, camera_hits
 
 CPU = torch.device("cpu")
 
@@ -73,6 +74,21 @@ def test_one_view_bounds_nothing() -> None:
         bounds(discs(1))
 
 
+@pytest.mark.parametrize(("radius", "count"), [(RADIUS / 4, 2), (RADIUS / 16, 1)])
+def test_a_second_piece_stays_if_masks_ask_for_it(radius: float, count: int) -> None:
+    balls = [trimesh.creation.icosphere(subdivisions=4, radius=r) for r in (20.0, radius)]
+    balls[1].apply_translation((33.0, 0, 0))
+    both = trimesh.util.concatenate(balls)
+    caster, made = RayCaster(Surface(np.array(both.vertices), np.array(both.faces))), []
+    for k, direction in enumerate(normalise(np.random.default_rng(0).normal(size=(10, 3)))):
+        camera = camera_at(direction)
+        mask = (camera_hits(caster, camera, np.indices((96, 96)).reshape(2, -1).T).face >= 0).reshape(96, 96)
+        made.append(View(f"view_{k + 1:02d}", camera, mask, np.ones((int(mask.sum()), 1, 3), np.uint16), 1.0, 65535, (1,)))
+    capture = Capture("two", tuple(made))
+    grid = signed_distance(capture, 96)
+    assert pieces(capture, grid) == count and piece_count(visual_hull(grid, count)) == count
+
+
 def test_masks_of_different_places_have_no_common_part() -> None:
     capture = discs(6)
     moved = [
@@ -87,12 +103,15 @@ def light_error(lights: Lights, truth: Lights) -> float:
     return float(np.mean([degrees(a, b).mean() for a, b in zip(lights.direction, truth.direction, strict=True)]))
 
 
-def lambertian(scene: SphereScene, seed: int | None = None, right: float = 0.4) -> tuple[Capture, Lights, Surface]:
-    """The sphere without lobes, albedo 0.7 and `right`; with a seed, other lights in every view."""
+def lambertian(scene: SphereScene, seed: int | None = None, right: float = 0.4, lamps: bool = False) -> tuple[Capture, Lights, Surface]:
+    """The sphere without lobes, albedo 0.7 and `right`; with a seed, other lights in every view; lamps: all around, fixed in the world."""
     reconstruction = scene.reconstruction
     lights = reconstruction.lights
-    if seed is not None:
-        rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
+    if lamps:
+        around, strength = normalise(rng.normal(size=(10, 3))), rng.uniform(0.6, 1.4, (10, 3))
+        lights = Lights((around,) * len(scene.capture.views), (strength,) * len(scene.capture.views), True, True)
+    elif seed is not None:
         directions = [
             normalise(np.concatenate([rng.normal(0, 0.5, (10, 2)), -np.ones((10, 1))], 1) @ view.camera.rotation)
             for view in scene.capture.views
@@ -102,7 +121,7 @@ def lambertian(scene: SphereScene, seed: int | None = None, right: float = 0.4) 
     for view, direction, intensity in zip(scene.capture.views, lights.direction, lights.intensity, strict=True):
         seen = normalise(np.nan_to_num(ball_normals(view)))
         shading = np.maximum(seen @ direction.T, 0)
-        albedo = np.where(view.pixels[:, 1:] < view.camera.width / 2, 0.7, right)
+        albedo = np.where(seen[:, :1] < 0, 0.7, right)
         radiance = albedo[:, None] * shading[..., None] * intensity
         views.append(replace(view, samples=np.rint(radiance / 2 * 65535).astype(np.uint16)))
     return Capture("lambertian", tuple(views)), lights, reconstruction.surface
@@ -124,6 +143,27 @@ def test_lights_of_a_lambertian_sphere_and_whether_one_rig_made_them(scene: Sphe
     found = uncalibrated_lights(capture, surface, 0)
     assert found.lights.one_rig == (seed is None)
     assert light_error(found.lights, truth) < 1.0 and found.fourth_singular_value < 0.1
+
+
+def test_lamps_around_the_object_that_stand_still_while_the_camera_moves(scene: SphereScene) -> None:
+    capture, truth, surface = lambertian(scene, 1, lamps=True)
+    found = uncalibrated_lights(capture, surface, 0)
+    # Half of them are behind the object in any view, which alone says nothing of their directions.
+    assert found.lights.one_rig and found.lights.fixed and light_error(found.lights, truth) < 2.0
+    assert "which stands still while the camera moves" in found.words()
+    assert not uncalibrated_lights(capture, surface, 0, may_share=False).lights.one_rig
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize(("seed", "lamps"), [(None, False), (1, True), (1, False)])
+def test_whose_few_lights_are(scene: SphereScene, count: int, seed: int | None, lamps: bool) -> None:
+    capture, truth, surface = lambertian(scene, seed, lamps=lamps)
+    numbers = tuple(range(1, count + 1))
+    found = uncalibrated_lights(capture.select({view.name: numbers for view in capture.views}), surface, 0).lights
+    assert found.one_rig == (seed is None or lamps) and found.fixed == lamps
+    error = np.mean([degrees(a, b[:count]).mean() for a, b in zip(found.direction, truth.direction, strict=True)])
+    # A lamp in the world lights no vertex twice from another side: that one half is darker may be the lamp's doing as well.
+    assert error < (10 if lamps else 2) or not found.one_rig
 
 
 def test_lights_survive_a_rough_shape_that_is_wrong_on_one_side(scene: SphereScene) -> None:
@@ -157,12 +197,15 @@ def test_flat_sides_are_taken_to_be_under_one_rig(monkeypatch: pytest.MonkeyPatc
     surface = visual_hull(signed_distance(capture, default_cells(capture)))
     calibration = uncalibrated_lights(capture, surface, 0)
     found = calibration.lights
-    assert found.one_rig and light_error(found, truth) < 10
-    assert calibration.assumed and "one rig for all views, which do not tell them one by one" in calibration.words()
+    assert found.one_rig and not found.fixed and light_error(found, truth) < 10 and calibration.under_normals
     # Three factors explain three sides whatever reflects: by the variances alone every view has lights of its own, and wrong ones.
-    monkeypatch.setattr(calibrate, "_mostly_fixed", lambda *_: True)
-    alone = uncalibrated_lights(capture, surface, 0).lights
+    alone = uncalibrated_lights(capture, surface, 0, may_share=False).lights
     assert not alone.one_rig and light_error(alone, truth) > 2 * light_error(found, truth)
+    # Where the shape's normals do not tell of a rig either, one is believed: single views say nothing.
+    monkeypatch.setattr(calibrate, "shared_frame", lambda *_: None)
+    assumed = uncalibrated_lights(capture, surface, 0)
+    assert assumed.assumed and "one rig for all views, which do not tell them one by one" in assumed.words()
+    assert assumed.lights.one_rig and not assumed.lights.fixed and light_error(assumed.lights, truth) < 10
 
 
 def test_a_rough_shape_that_faces_one_way_tells_no_lights(scene: SphereScene) -> None:
@@ -197,7 +240,7 @@ def test_photometric_stereo_of_a_lambertian_sphere(scene: SphereScene) -> None:
     maps = normal_map(view, lights.direction[0], lights.intensity[0], CPU)
     error = degrees(maps.normal, ball_normals(view))
     assert np.median(error) < 0.1 and np.quantile(error, 0.9) < 2
-    expected = np.where(view.pixels[:, 1:] < view.camera.width / 2, 0.7, 0.4)
+    expected = np.where(ball_normals(view)[:, :1] < 0, 0.7, 0.4)
     sure = maps.confidence > 0.9
     assert sure.mean() > 0.7 and np.abs(maps.albedo - expected)[sure].max() < 0.02
 

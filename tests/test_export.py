@@ -70,11 +70,25 @@ def assert_same(a: Reconstruction, b: Reconstruction) -> None:
         np.testing.assert_array_equal(x, y)
     for name in ("views", "light_names", "metrics", "settings"):
         assert getattr(a, name) == getattr(b, name)
-    assert a.lights.one_rig == b.lights.one_rig
+    assert (a.lights.one_rig, a.lights.fixed) == (b.lights.one_rig, b.lights.fixed)
 
 
 def test_what_is_read_is_what_was_written(scene: SphereScene, folder: Path) -> None:
     assert_same(read_reconstruction(folder), scene.reconstruction)
+
+
+def test_a_rig_that_stands_still_in_the_world(scene: SphereScene, tmp_path: Path) -> None:
+    r = scene.reconstruction
+    fixed = replace(r, lights=replace(r.lights, fixed=True))
+    write_reconstruction(fixed, tmp_path / "result")
+    record = json.loads((tmp_path / "result" / "lights.json").read_text())
+    assert record["fixed"] is True and record["one_rig"] is False
+    assert_same(read_reconstruction(tmp_path / "result"), fixed)
+    # Results of before such rigs were told have no word of it.
+    del record["fixed"]
+    (tmp_path / "result" / "lights.json").write_text(json.dumps(record))
+    old = read_reconstruction(tmp_path / "result").lights
+    assert not old.one_rig and not old.fixed
 
 
 def test_views_keep_their_order_and_may_have_no_light_and_no_lobe(scene: SphereScene, tmp_path: Path) -> None:

@@ -86,11 +86,14 @@ def test_remeshing_keeps_the_sharp_rim_of_a_thin_part() -> None:
     assert np.isclose(np.linalg.norm(meshed.vertices[:, :2], axis=1).max(), 1, atol=0.01)
 
 
-def test_largest_component_is_kept_and_unused_vertices_go() -> None:
+def test_largest_pieces_are_kept_and_unused_vertices_go() -> None:
     big, small = sphere(3), sphere(1, 0.5)
     both = Surface(np.concatenate([small.vertices + 9, big.vertices]), np.concatenate([small.faces, big.faces + len(small.vertices)]))
-    kept = mesh.largest_component(both)
+    kept = mesh.largest_pieces(both)
     assert len(kept.vertices) == len(big.vertices) and np.isclose(signed_volume(kept), signed_volume(big))
+    assert mesh.piece_count(both) == 2 and mesh.piece_count(kept) == 1
+    assert len(mesh.largest_pieces(both, 2).faces) == len(both.faces)
+    assert mesh.piece_count(mesh.isotropic_remesh(both, 0.3)) == 2
 
 
 def test_turning_the_faces_turns_the_volume_negative() -> None:

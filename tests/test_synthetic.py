@@ -11,7 +11,7 @@ from references import is_closed, signed_volume
 from mvps.command import run
 from mvps.load import read_calibrated_lights, read_capture, read_truth
 from mvps.measures import angles_deg, mesh_normal_errors
-from mvps.mesh import largest_component, vertex_normals
+from mvps.mesh import largest_pieces, vertex_normals
 from mvps.rendering import points_under
 from mvps.scene import Camera, CaptureError, Lights, Surface
 from mvps.synthetic.__main__ import main
@@ -96,7 +96,7 @@ def test_the_mesh_lies_on_the_zero_set(seed: int) -> None:
     surface, normal = mesh_of(shape, 96)
     assert is_closed(surface)
     assert signed_volume(surface) > 0
-    assert len(largest_component(surface).faces) == len(surface.faces)
+    assert len(largest_pieces(surface).faces) == len(surface.faces)
     assert np.abs(shape(surface.vertices)).max() < 1e-6
     assert np.median(angles_deg(vertex_normals(surface), normal)) < 1
 

@@ -74,6 +74,16 @@ def test_one_rig_within_a_milliradian(with_truth: Path, angle: float, one_rig: b
     assert read_calibrated_lights(with_truth, read_capture(with_truth)).one_rig is one_rig
 
 
+def test_lights_that_stand_still_while_the_camera_moves(with_truth: Path) -> None:
+    in_world = np.array([[0.6, 0, 0.8], [0, 0.6, 0.8], [0, 0, 1]])
+    for number in (1, 2):
+        axes = rotation(number).T @ np.diag([1, -1, -1])
+        np.savetxt(with_truth / f"view_{number:02d}" / "light_directions.txt", in_world @ axes, fmt="%.9f")
+    lights = read_calibrated_lights(with_truth, read_capture(with_truth))
+    assert lights.one_rig and lights.fixed
+    np.testing.assert_allclose(lights.direction[1], in_world, atol=1e-8)
+
+
 TRUTH_COMPLAINTS: list[tuple[str, bytes | None, str]] = [
     ("light_directions.txt", b"", "0 bytes"),
     ("light_directions.txt", b"1 2 x\n", "three numbers per line"),

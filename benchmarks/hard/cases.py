@@ -73,6 +73,8 @@ def _lights() -> Iterator[tuple[str, Callable[[], Sample]]]:
     for count in (1, 2, 3, 4, 8):
         yield f"lights-{count}", partial(of_scene, replace(BASE, lights=count))
     yield "lights-free", partial(of_scene, replace(BASE, free_lights=True))
+    yield "lights-fixed", partial(of_scene, change=partial(scenes.lamps, count=24))
+    yield "lights-fixed-3", partial(of_scene, change=partial(scenes.lamps, count=3))
     yield "lights-cone-15-deg", partial(of_scene, replace(BASE, spread=15.0))
     yield "lights-one-plane", partial(of_scene, change=scenes.in_one_plane)
     yield "lights-1-to-100", partial(of_scene, change=lambda scene: scenes.unequal(scene, 100))
@@ -84,6 +86,7 @@ def _lights() -> Iterator[tuple[str, Callable[[], Sample]]]:
 def _views() -> Iterator[tuple[str, Callable[[], Sample]]]:
     for count in (1, 2, 3, 5):
         yield f"views-{count}", partial(of_scene, replace(BASE, views=count))
+    yield "views-from-above", partial(of_scene, change=scenes.from_above)
 
 
 def _materials() -> Iterator[tuple[str, Callable[[], Sample]]]:
@@ -140,7 +143,7 @@ def _cameras() -> Iterator[tuple[str, Callable[[], Sample]]]:
 def _shapes() -> Iterator[tuple[str, Callable[[], Sample]]]:
     for px in (0.5, 1, 2):
         yield f"shape-rods-{_number(px)}-px", partial(of_shape, partial(scenes.rods, px))
-    for name in ("bowl", "touching", "slab", "sphere"):
+    for name in ("bowl", "touching", "chain", "slab", "sphere"):
         yield f"shape-{name}", partial(of_shape, getattr(scenes, name))
     yield "shape-bowl-lit-within", partial(of_shape, scenes.bowl, scenes.lit_between)
     for name, height in (("plane", 0.0), ("open", 0.08)):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvps.mesh import largest_component, normalise
+from mvps.mesh import largest_pieces, normalise
 from mvps.scene import Float, Surface
 from mvps.synthetic.shape import BLEND, Shape, mesh_of
 
@@ -53,7 +53,7 @@ class Lumps(Shape):
 
 def lumps(seed: int) -> Surface:
     """The object, centred in the unit ball; the same seed gives the same."""
-    surface = largest_component(mesh_of(Lumps(np.random.default_rng((seed, 11))), CELLS)[0])
+    surface = largest_pieces(mesh_of(Lumps(np.random.default_rng((seed, 11))), CELLS)[0])
     middle = (surface.vertices.min(0) + surface.vertices.max(0)) / 2
     local = surface.vertices - middle
     return Surface(local / np.linalg.norm(local, axis=1).max(), surface.faces)

@@ -20,6 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mvps.camera import view_directions
 from mvps.mesh import normalise, vertex_normals
@@ -70,6 +71,16 @@ def coloured(scene: Scene) -> Scene:
     """Red, green, blue, yellow ... lights: every channel between 0.1 and 1."""
     intensity = np.random.default_rng(0).uniform(0.1, 1, scene.lights.intensity[0].shape)
     return replace(scene, lights=replace(scene.lights, intensity=(intensity / intensity.mean(),) * len(scene.cameras)))
+
+
+def lamps(scene: Scene, count: int) -> Scene:
+    """Lamps on all sides of the object that stand still while the camera moves: many are behind the object, of which a view sees rims."""
+    k = np.arange(count)
+    height, azimuth = 1 - 2 * (k + 0.5) / count, np.pi * (3 - np.sqrt(5)) * k
+    direction = np.stack([np.sqrt(1 - height**2) * np.cos(azimuth), np.sqrt(1 - height**2) * np.sin(azimuth), height], -1)
+    intensity = np.exp(0.35 * np.random.default_rng(0).normal(size=(count, 1))) * np.ones(3)
+    views = len(scene.cameras)
+    return replace(scene, lights=Lights((direction,) * views, (intensity / intensity.mean(),) * views, True, True))
 
 
 def near(distance: float) -> Photograph:
@@ -210,6 +221,15 @@ def touching() -> Surface:
     return surface_of(*balls)
 
 
+def chain() -> Surface:
+    """Two rings, one through the other, that do not touch."""
+    rings = [trimesh.creation.torus(0.45, 0.13, major_sections=160, minor_sections=48) for _ in range(2)]
+    rings[0].apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+    for ring, x in zip(rings, (-0.28, 0.28), strict=True):
+        ring.apply_translation((x, 0, 0))
+    return surface_of(*rings)
+
+
 def rods(width: float, size: int = BASE.size) -> Surface:
     """A ball with eight rods, this many pixels of an image of `size` pixels wide and 0.4 of the object's radius long."""
     radius = width / (0.9 * size)
@@ -230,3 +250,14 @@ def zoomed(scene: Scene, factor: float) -> Scene:
         replace(c, K=np.diag([factor, factor, 1.0]) @ c.K + (1 - factor) * c.K * [[0, 0, 1], [0, 0, 1], [0, 0, 0]]) for c in scene.cameras
     )
     return replace(scene, cameras=cameras)
+
+
+def from_above(scene: Scene) -> Scene:
+    """Every third and fourth camera 45 degrees higher, up to 85 above the equator, with its rig."""
+    higher = Rotation.from_euler("x", 45, degrees=True).as_matrix()
+    cameras, directions = [], []
+    for k, (camera, direction) in enumerate(zip(scene.cameras, scene.lights.direction, strict=True)):
+        rotation = higher @ camera.rotation if k % 4 > 1 else camera.rotation
+        cameras.append(replace(camera, rotation=rotation))
+        directions.append(direction @ camera.rotation.T @ rotation)
+    return replace(scene, cameras=tuple(cameras), lights=replace(scene.lights, direction=tuple(directions)))

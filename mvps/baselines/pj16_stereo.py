@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from mvps.baselines.pj16_domain import Domain, Warped
 from mvps.calibrate import BRIGHT_QUANTILE, SHADOWED, normalised
+from mvps.camera import rig_frame
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise
 from mvps.scene import RELIABLE, Bool, Float, Int, Lights
@@ -108,14 +109,14 @@ def lights_on(domain: Domain, warped: Warped, start: Lights, seed: int) -> Light
 
 
 def _as_lights(warped: Warped, scaled: list[Float32], start: Lights) -> Lights:
-    """Lights of `scaled`, per view (lights, 3); of one rig, their mean over the views in the camera's frame. Colours as in `start`."""
-    rotations = [view.camera.rotation for view in warped.capture.views]
+    """Lights of `scaled`, per view (lights, 3); of one rig, their mean over the views in its frame. Colours as in `start`."""
+    rotations = [rig_frame(start, view.camera) for view in warped.capture.views]
     if start.one_rig:
         rig = np.mean([s @ R.T for s, R in zip(scaled, rotations, strict=True)], axis=0)
         scaled = [rig @ R for R in rotations]
     ratio = [e / e.mean(1, keepdims=True) for e in start.intensity]
     intensity = [lengths(s)[:, None] * r for s, r in zip(scaled, ratio, strict=True)]
-    return normalised([normalise(s.astype(np.float64)) for s in scaled], intensity, start.one_rig)
+    return normalised([normalise(s.astype(np.float64)) for s in scaled], intensity, start.one_rig, start.fixed)
 
 
 class TexelNormals(NamedTuple):

@@ -63,7 +63,7 @@ def part(capture: Capture, lights: Lights, start: int, stride: int) -> tuple[Cap
     """Every stride-th light of each view from `start` on."""
     kept = capture.select({view.name: view.lights[start::stride] for view in capture.views})
     direction, intensity = (tuple(values[start::stride] for values in of_views) for of_views in (lights.direction, lights.intensity))
-    return kept, Lights(direction, intensity, lights.one_rig)
+    return kept, replace(lights, direction=direction, intensity=intensity)
 
 
 def _slopes(view: View, image: Float, intensity: Float) -> tuple[Float, Bool]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,8 @@ def grey_lights(lights: Lights, device: torch.device) -> list[DirectionalLights]
     ]
 
 
-def coloured_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig: bool) -> Lights:
-    """Lights from directions, mean intensities and channel ratios (lights, 3)."""
+def coloured_lights(grey: list[DirectionalLights], ratios: list[Float], like: Lights) -> Lights:
+    """Lights from directions, mean intensities and channel ratios (lights, 3); of one rig where `like` is."""
     directions = [normalise(of_view.direction.double().cpu().numpy()) for of_view in grey]
     intensities = [of_view.intensity.double().cpu().numpy()[:, None] * r for of_view, r in zip(grey, ratios, strict=True)]
-    return Lights(tuple(directions), tuple(intensities), one_rig)
+    return replace(like, direction=tuple(directions), intensity=tuple(intensities))

@@ -6,23 +6,26 @@ Views of one rig share their lights; the rig's lights carry over to a view that 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
+from mvps.camera import rig_frame
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
 from mvps.joint.colours import ratios_of_known
 from mvps.joint.lighting import LIGHT_VERTICES, drawn
 from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
 from mvps.joint.reflectance import Observed
-from mvps.scene import Capture, Float, Law, Lights, Material, Surface
+from mvps.scene import Camera, Capture, Float, Law, Lights, Material, Surface
 
 STEPS = 6
 
 
-def carried_over(lights: Lights, rotations: list[Float], rotation: Float) -> tuple[Float, Float]:
-    """Direction and intensity (lights, 3) of a rig's lights in a view with camera_from_world `rotation`, from its first view."""
-    return np.asarray(lights.direction[0]) @ rotations[0].T @ rotation, np.asarray(lights.intensity[0])
+def carried_over(lights: Lights, first: Camera, camera: Camera) -> tuple[Float, Float]:
+    """Direction and intensity (lights, 3) of a rig's lights in a view with `camera`, from its first view."""
+    return np.asarray(lights.direction[0]) @ rig_frame(lights, first).T @ rig_frame(lights, camera), np.asarray(lights.intensity[0])
 
 
 def _tint(material: Material) -> Float:
@@ -44,7 +47,7 @@ def _vertices(material: Material, device: torch.device) -> Vertices:
 
 
 def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[torch.Tensor], one_rig: bool) -> list[torch.Tensor]:
-    """Per view m (lights, 3) in the camera's frame."""
+    """Per view m (lights, 3) in the frame of its rotation."""
     sums = []
     for samples, rotation in zip(views, rotations, strict=True):
         n = vertices.normal[samples.vertex] @ rotation.T * vertices.reflectance[samples.vertex, :1]
@@ -55,7 +58,7 @@ def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[to
     eye = torch.eye(3, device=vertices.normal.device)
     damping = [(1e-6 * H.diagonal(dim1=1, dim2=2).mean()).clamp_min(1e-12) for H, _ in sums]
     solved = [torch.linalg.solve(H + d * eye, g[..., None])[..., 0] for (H, g), d in zip(sums, damping, strict=True)]
-    # A photograph that was left out says nothing of its light: at the camera.
+    # A photograph that was left out says nothing of its light: at the camera, or anywhere.
     toward = torch.tensor([0.0, 0.0, -1.0], device=eye.device)
     return [torch.where(m.norm(dim=1, keepdim=True) > 0, m, toward) for m in solved]
 
@@ -96,26 +99,28 @@ def _from_product(m: torch.Tensor, rotation: torch.Tensor) -> DirectionalLights:
     return DirectionalLights(m / length[:, None] @ rotation, length)
 
 
-def _as_lights(grey: list[DirectionalLights], ratios: list[Float], one_rig: bool) -> Lights:
+def _as_lights(grey: list[DirectionalLights], ratios: list[Float], like: Lights) -> Lights:
     directions = [g.direction.double().cpu().numpy() for g in grey]
     unit = tuple(d / np.linalg.norm(d, axis=1, keepdims=True) for d in directions)
-    return Lights(unit, tuple(g.intensity.double().cpu().numpy()[:, None] * r for g, r in zip(grey, ratios, strict=True)), one_rig)
+    intensity = tuple(g.intensity.double().cpu().numpy()[:, None] * r for g, r in zip(grey, ratios, strict=True))
+    return replace(like, direction=unit, intensity=intensity)
 
 
-def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: bool, device: torch.device) -> Lights:
-    """Lights of all photographs of `capture` for a known surface and material. one_rig: its views share them."""
+def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: bool, device: torch.device, fixed: bool = False) -> Lights:
+    """Lights of all photographs of `capture` for a known surface and material. one_rig: its views share them; fixed: in the world."""
     torch.set_num_threads(1)
-    rotations = [torch.tensor(view.camera.rotation, dtype=torch.float32, device=device) for view in capture.views]
     # With the light at the camera no visible vertex is in shadow.
     from_camera = [np.tile(-view.camera.rotation[2], (len(view.lights), 1)) for view in capture.views]
     white = [np.ones_like(d) for d in from_camera]
-    views = observe(capture, surface, Lights(tuple(from_camera), tuple(white), one_rig), device, shadows=material.law.shadows)
+    start = Lights(tuple(from_camera), tuple(white), one_rig, fixed)
+    rotations = [torch.tensor(rig_frame(start, view.camera), dtype=torch.float32, device=device) for view in capture.views]
+    views = observe(capture, surface, start, device, shadows=material.law.shadows)
     vertices = _vertices(material, device)
     products = _lambertian(views, vertices, rotations, one_rig)
     grey = [_from_product(m, rotation) for m, rotation in zip(products, rotations, strict=True)]
     sent = coarse_senders(surface, material, grey=True)
     for _ in range(2):
-        lights = _as_lights(grey, [channel_ratio(e) for e in white], one_rig)
+        lights = _as_lights(grey, [channel_ratio(e) for e in white], start)
         views = observe(capture, surface, lights, device, shadows=material.law.shadows)
         if sent is not None:
             views = with_gathered(views, capture, surface, sent, lights)
@@ -125,4 +130,4 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     rows = [samples.of_vertices(some, len(vertices.normal)) for samples in views]
     of = Observed(capture, surface, rows, vertices, grey, material.law)
     ratios = ratios_of_known(of, material.albedo, _tint(material), one_rig)
-    return _as_lights(grey, ratios, one_rig)
+    return _as_lights(grey, ratios, start)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvps.camera import surface_pixel
+from mvps.camera import rig_frame, surface_pixel
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.colours import light_ratios
 from mvps.joint.grey import coloured_lights, grey_lights, tensor32
@@ -72,7 +72,7 @@ def solved_lights(
     single = of_one_normal(state.surface, vertices.normal, pixel, max(state.law.sharpness, default=1.0))
     few = [replace(samples, weight=samples.weight * single[samples.vertex]) for samples in few]
     few, part, tie = subset(few, vertices, anchor, patches.vertex)
-    rotations = [tensor32(view.camera.rotation, patches.vertex.device) for view in capture.views]
+    rotations = [tensor32(rig_frame(state.lights, view.camera), patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)
     before = lights
     for _ in range(LIGHT_STEPS):
@@ -82,7 +82,7 @@ def solved_lights(
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie, patches=patches)
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
-    solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights.one_rig)
+    solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)
     return solved, float(np.concatenate(turned).mean())
 
 
@@ -105,4 +105,4 @@ def with_colours(state: State, capture: Capture, few: list[ViewSamples], some: t
     rows = [samples.of_vertices(some, len(state.vertices.normal)) for samples in few]
     ratios, grey = [channel_ratio(e) for e in state.lights.intensity], grey_lights(state.lights, some.device)
     ratios = light_ratios(Observed(capture, state.surface, rows, state.vertices, grey, state.law), ratios, state.lights.one_rig)
-    return coloured_lights(grey, ratios, state.lights.one_rig)
+    return coloured_lights(grey, ratios, state.lights)

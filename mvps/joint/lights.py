@@ -244,7 +244,7 @@ def light_step(
 ) -> tuple[list[DirectionalLights], Law]:
     """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated.
 
-    rotations: camera_from_world of the views, float32.
+    rotations: from the world to the frames in which the views' lights are unknown (rig_frame in camera.py), float32.
     """
     layout = _layout(lights, one_rig, free_lights)
     step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free)

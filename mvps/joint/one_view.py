@@ -66,7 +66,7 @@ def _without_relief(
     share = np.where(grey > 0, albedo / np.maximum(grey, 1e-300), 1.0)
     solved = np.where(maps.confidence[:, None] > 0, moved, normal).astype(np.float32)
     solved /= lengths(solved)[:, None]
-    return Lights((turned_direction,), (strength[:, None] * colour,), lights.one_rig), NormalMap(
+    return replace(lights, direction=(turned_direction,), intensity=(strength[:, None] * colour,)), NormalMap(
         solved, (maps.albedo * share[:, None]).astype(np.float32), maps.confidence
     )
 

@@ -78,12 +78,15 @@ def read_calibrated_lights(path: str | Path, capture: Capture) -> Lights:
         directions.append(in_camera[-1] @ _world_from_diligent(calibration, int(view.name[5:])).T)
         intensities.append(tables[1][rows])
     mean = np.concatenate(intensities).mean()
-    # The chord of an angle this small is the angle.
-    one_rig = all(
-        view.lights == capture.views[0].lights and np.linalg.norm(local - in_camera[0], axis=-1).max() <= ONE_RIG_TOLERANCE
-        for view, local in zip(capture.views, in_camera, strict=True)
-    )
-    return Lights(tuple(directions), tuple(table / mean for table in intensities), one_rig)
+    numbered = all(view.lights == capture.views[0].lights for view in capture.views)
+    with_camera, in_world = numbered and _alike(in_camera), numbered and _alike(directions)
+    fixed = in_world and not with_camera
+    return Lights(tuple(directions), tuple(table / mean for table in intensities), with_camera or fixed, fixed)
+
+
+def _alike(directions: list[Float]) -> bool:
+    """Whether all views' directions (lights, 3) are the first one's. The chord of an angle this small is the angle."""
+    return all(np.linalg.norm(of_view - directions[0], axis=-1).max() <= ONE_RIG_TOLERANCE for of_view in directions)
 
 
 def _world_from_diligent(calibration: Calibration, number: int) -> Float:

@@ -236,13 +236,14 @@ def _pictures(reconstruction: Reconstruction, capture: Capture) -> str:
 
 
 def _lights(reconstruction: Reconstruction, capture: Capture) -> str:
-    """One sphere for a rig, one for each view shown otherwise; in the camera's frame with y up."""
-    views = _known_views(reconstruction, capture)[: 1 if reconstruction.lights.one_rig else VIEWS_SHOWN]
+    """One sphere for a rig that stands still with the camera, one for each view shown otherwise; in the camera's frame with y up."""
+    alike = reconstruction.lights.one_rig and not reconstruction.lights.fixed
+    views = _known_views(reconstruction, capture)[: 1 if alike else VIEWS_SHOWN]
     spheres = []
     for view in views:
         place = reconstruction.views.index(view.name)
         local = reconstruction.lights.direction[place] @ view.camera.rotation.T @ DILIGENT_FROM_CAMERA
-        name = "all views" if reconstruction.lights.one_rig else view.name
+        name = "all views" if alike else view.name
         spheres.append(light_sphere(local, reconstruction.lights.intensity[place], reconstruction.light_names[place], name))
     if not spheres:
         return ""

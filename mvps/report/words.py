@@ -35,7 +35,8 @@ def captured(reconstruction: Reconstruction, views: Sequence[View]) -> list[tupl
     """What was captured, as names and words. views: those of the capture that the reconstruction holds."""
     settings, vertices = reconstruction.settings, reconstruction.surface.vertices
     counts = [len(numbers) for numbers in reconstruction.light_names]
-    rig = "one rig that stands still in the camera's frame" if reconstruction.lights.one_rig else "other ones in every view"
+    stands = "world while the camera moves" if reconstruction.lights.fixed else "camera's frame"
+    rig = f"one rig that stands still in the {stands}" if reconstruction.lights.one_rig else "other ones in every view"
     given = {True: "; taken from the capture's calibration", False: "; solved from the photographs"}
     solved = settings.get("calibrated_lights")
     size = vertices.max(0) - vertices.min(0)
