@@ -41,11 +41,11 @@ long as the residual falls."""
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
     from mvps.camera import surface_pixel
-    from mvps.hull import default_cells, pieces, signed_distance, visual_hull
+    from mvps.hull import default_cells, hull_of_masks, signed_distance
 
     with progress.stage("visual hull") as stage:
         grid = signed_distance(capture, default_cells(capture))
-        surface = visual_hull(grid, pieces(capture, grid))
+        surface = hull_of_masks(capture, grid)
         pixel = surface_pixel(capture, surface)
         stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing / pixel:.2g} pixels")
     return grid, surface

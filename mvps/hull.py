@@ -136,16 +136,18 @@ def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
     return _sample(masks, low, high, cells)
 
 
-def pieces(capture: Capture, grid: SignedDistanceGrid) -> int:
-    """Of how many pieces the hull is to be: the fewest of the largest such that no other piece is alone in covering a share ALONE of the
-    masks. What masks do not ask for are cells of noise, and ghosts where the cones of several parts meet."""
+def hull_of_masks(capture: Capture, grid: SignedDistanceGrid) -> Surface:
+    """The hull with all pieces that masks ask for: the largest, and the next as long as it alone covers a share ALONE of the masks. What
+    masks do not ask for are cells of noise, and ghosts where the cones of several parts meet."""
     whole = _level_set(grid)
     asked = int(sum(view.mask.sum() for view in capture.views))
-    for count in range(1, piece_count(whole)):
-        fewer, more = (covered(largest_pieces(whole, n), capture) for n in (count, count + 1))
-        if more - fewer < ALONE * asked:
-            return count
-    return max(piece_count(whole), 1)
+    kept = largest_pieces(whole)
+    for count in range(2, piece_count(whole) + 1):
+        more = largest_pieces(whole, count)
+        if covered(more, capture) - covered(kept, capture) < ALONE * asked:
+            break
+        kept = more
+    return kept
 
 
 def covered(surface: Surface, capture: Capture) -> int:

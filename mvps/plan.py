@@ -25,7 +25,7 @@ class Parts:
     model        all that the reflectance may have
     microfacet   lobes are distributions of microfacets (shading.py)
     shadows      cast shadows are traced
-    one_rig      lights that stand still with the camera are looked for
+    one_rig      lights that all views share are looked for
     free_lights  lights are refined after their first estimate
     moves        vertices move in the last rounds, to where views agree; without, the surface is Stage I's (`draft`: the hull)
     edges        of the meshes, over those of the preset: a budget

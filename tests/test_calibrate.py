@@ -12,7 +12,7 @@ from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps import calibrate
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
-from mvps.hull import bounds, default_cells, pieces, signed_distance, visual_hull
+from mvps.hull import bounds, default_cells, hull_of_masks, signed_distance, visual_hull
 from mvps.mesh import normalise, piece_count, vertex_normals
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
@@ -86,7 +86,7 @@ def test_a_second_piece_stays_if_masks_ask_for_it(radius: float, count: int) -> 
         made.append(View(f"view_{k + 1:02d}", camera, mask, np.ones((int(mask.sum()), 1, 3), np.uint16), 1.0, 65535, (1,)))
     capture = Capture("two", tuple(made))
     grid = signed_distance(capture, 96)
-    assert pieces(capture, grid) == count and piece_count(visual_hull(grid, count)) == count
+    assert piece_count(hull_of_masks(capture, grid)) == count and piece_count(visual_hull(grid)) == 1
 
 
 def test_masks_of_different_places_have_no_common_part() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from sphere_scene import RADIUS, SphereScene, make_sphere
 
 from mvps.mesh import lengths
 from mvps.nearness import nearness
-from mvps.rendering import points_under
+from mvps.rendering import photograph, points_under
 from mvps.scene import Capture, View
 from mvps.visibility import ray_caster
 
@@ -44,6 +45,29 @@ def test_far_lights_are_not_near(scene: SphereScene) -> None:
     r = scene.reconstruction
     found = nearness(scene.capture, r.surface, r.material, r.lights)
     assert not found.near and abs(found.slope) < 0.002
+
+
+def test_what_surfaces_send_each_other_is_asked_before_lights_are_said_to_be_near(
+    scene: SphereScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    r, asked = scene.reconstruction, []
+    near = under_points(scene, 6 * RADIUS)
+    by_view = {view.camera: view for view in near.views}
+
+    def explained(*given: Any) -> np.ndarray:
+        _, _, camera, pixels, direction, _, arriving = given
+        if arriving is None:
+            return photograph(*given)
+        asked.append(len(direction))
+        view = by_view[camera]
+        return view.samples[view.pixel_index[tuple(pixels.T)]][:, : len(direction)] * view.scale
+
+    monkeypatch.setattr("mvps.nearness.photograph", explained)
+    monkeypatch.setattr("mvps.nearness.light_arriving", lambda senders, *_: senders)
+    monkeypatch.setattr("mvps.nearness.light_senders", lambda *_: "senders")
+    assert not nearness(near, r.surface, r.material, r.lights).near and asked == [10] * len(near.views)
+    asked.clear()
+    assert not nearness(scene.capture, r.surface, r.material, r.lights).near and not asked
 
 
 def test_dark_photographs_say_nothing(scene: SphereScene) -> None:

@@ -223,9 +223,9 @@ def touching() -> Surface:
 
 def chain() -> Surface:
     """Two rings, one through the other, that do not touch."""
-    rings = [trimesh.creation.torus(0.45, 0.13, major_sections=160, minor_sections=48) for _ in range(2)]
+    rings = [trimesh.creation.torus(0.45, 0.08, major_sections=160, minor_sections=48) for _ in range(2)]
     rings[0].apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
-    for ring, x in zip(rings, (-0.28, 0.28), strict=True):
+    for ring, x in zip(rings, (-0.25, 0.25), strict=True):
         ring.apply_translation((x, 0, 0))
     return surface_of(*rings)
 
