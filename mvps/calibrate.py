@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.cores import on_cores
-from mvps.correlation import glossy_lights, is_glossy
+from mvps.correlation import glossy_lights, is_glossy, lamps_of_a_glossy_surface
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface, View
 from mvps.sharing import Frame, shared_frame
@@ -324,6 +324,9 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
         if found is not None:
             return found
     if is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator):
+        lamps = _glossy_lamps(capture, samples) if may_share else None
+        if lamps is not None:
+            return Calibration(_assemble(capture, [lamps] * len(samples), True, fixed=True), residual, fourth, True)
         scaled = [glossy_lights(s.absolute, s.normal) for s in samples]
         return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
     each = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
@@ -344,22 +347,29 @@ def _one_rig(
     pooled = _pooled(samples)
     together = factorise(pooled.image, pooled.known, 3, floor=pooled.noise)
     alike = together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
-    frame = shared_frame(capture, caster, np.random.default_rng(seed))
+    left, fourth = together.residual, float(together.singular_values[3])
+    metallic = is_glossy([pooled.absolute], [pooled.normal], generator)
+    lamps = _glossy_lamps(capture, samples) if metallic else None
+    if lamps is not None:
+        return Calibration(_assemble(capture, [lamps] * len(samples), True, fixed=True), left, fourth, True)
+    # Highlights hide what normals tell.
+    frame = None if metallic else shared_frame(capture, caster, np.random.default_rng(seed))
     flat = not alike and frame is None and not _mostly_fixed(separate, samples)
     if not (alike or frame or flat):
-        return None
-    fixed = frame == "world"
-    metallic = is_glossy([pooled.absolute], [pooled.normal], generator)
-    if metallic and (fixed or not (alike or flat)):
-        # Highlights hang on where the camera is, and hide what normals tell.
         return None
     if metallic:
         rig, left_open = glossy_lights(pooled.absolute, pooled.normal), False
     else:
-        factors = together if (alike or flat) and not fixed else None
+        factors = None if frame == "world" or not (alike or flat) else together
         rig, left_open = _scaled_lights(factors, _in_frame(samples, capture, frame or "camera"))
-    lights = _assemble(capture, [rig] * len(samples), True, fixed)
-    return Calibration(lights, together.residual, float(together.singular_values[3]), metallic, flat, left_open)
+    lights = _assemble(capture, [rig] * len(samples), True, frame == "world")
+    return Calibration(lights, left, fourth, metallic, flat, left_open)
+
+
+def _glossy_lamps(capture: Capture, samples: list[_Sampled]) -> Float | None:
+    """Lights of a glossy surface that stand still in the world, where they do (correlation.py)."""
+    rotations = [view.camera.rotation for view in capture.views]
+    return lamps_of_a_glossy_surface([s.absolute for s in samples], [s.normal for s in samples], rotations)
 
 
 def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from mvps.correlation import TOWARDS_CAMERA, directions, glossy_lights, is_glossy, searched
+from mvps.correlation import TOWARDS_CAMERA, directions, glossy_lights, is_glossy, lamps_of_a_glossy_surface, searched, sphere
 from mvps.mesh import angles_deg, normalise
 
 RNG = np.random.default_rng(0)
@@ -51,3 +52,28 @@ def test_a_photograph_without_light_has_finite_lights() -> None:
     image[:, 3] = 0
     found = glossy_lights(image, NORMAL)
     assert np.isfinite(found).all() and (np.linalg.norm(found, axis=1) > 0).all()
+
+
+ROTATIONS = [Rotation.from_euler("y", 60 * k, degrees=True).as_matrix() for k in range(6)]
+
+
+def photographed_from(rotation: np.ndarray, light: np.ndarray) -> np.ndarray:
+    """(n, lights) of a metal ball in a view, of lights (lights, 3) in the world's frame."""
+    seen = light @ rotation.T
+    half = normalise(seen + TOWARDS_CAMERA)
+    image: np.ndarray = ALBEDO * np.maximum(TRUE_NORMAL @ seen.T, 0) * np.exp(20 * (TRUE_NORMAL @ half.T - 1)) * INTENSITY
+    return image
+
+
+def test_lamps_around_a_metal_that_stand_still_while_the_camera_moves() -> None:
+    lamps = sphere(12)
+    found = lamps_of_a_glossy_surface([photographed_from(R, lamps) for R in ROTATIONS], [NORMAL] * 6, ROTATIONS)
+    assert found is not None and angles_deg(normalise(found), lamps).mean() < 5
+    level = np.linalg.norm(found, axis=1) / INTENSITY
+    assert level.std() / level.mean() < 0.15
+    # A rig that moves with the camera, lights that are others in every view, and normals that are none tell no such lamps.
+    assert lamps_of_a_glossy_surface([photographed(20.0, 0.0)] * 6, [NORMAL] * 6, ROTATIONS) is None
+    others = [photographed_from(R, normalise(RNG.normal(size=(12, 3)))) for R in ROTATIONS]
+    assert lamps_of_a_glossy_surface(others, [NORMAL] * 6, ROTATIONS) is None
+    wrong = normalise(RNG.normal(size=NORMAL.shape))
+    assert lamps_of_a_glossy_surface([photographed_from(R, lamps) for R in ROTATIONS], [wrong] * 6, ROTATIONS) is None
