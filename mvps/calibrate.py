@@ -99,19 +99,26 @@ class Calibration:
 
 @dataclass(frozen=True)
 class _Sampled:
-    """Grey images of some pixels of one view: image (n, lights) over its bright level (n,); normal (n, 3) in the camera's frame."""
+    """Grey images of some pixels of one view: image (n, lights) over its bright level (n,); known (n, lights), neither clipped nor in
+    shadow; normal (n, 3) in the camera's frame; shown (n, lights), False where the photograph was left out."""
 
     image: NDArray[np.float64]
     bright: Float
     known: Bool
     normal: Float
     noise: float
+    shown: Bool
 
     @property
     def absolute(self) -> Float:
         """(n, lights) radiance."""
         absolute: Float = self.image * self.bright[:, None]
         return absolute
+
+    @property
+    def highlights(self) -> Float:
+        """(n, lights) radiance, clipped or not, NaN where the photograph was left out."""
+        return np.where(self.shown, self.absolute, np.nan)
 
 
 def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> _Sampled:
@@ -129,13 +136,15 @@ def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.
     bright = np.maximum(bright, view.scale)
     known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
     seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
-    return _Sampled(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)))
+    shown = np.broadcast_to(view.shown, image.shape)
+    return _Sampled(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)), shown)
 
 
 def _pooled(samples: list[_Sampled]) -> _Sampled:
     """The pixels of all views as if they were one's."""
-    image, bright, known, normal = (np.concatenate([getattr(s, name) for s in samples]) for name in ("image", "bright", "known", "normal"))
-    return _Sampled(image, bright, known, normal, float(np.median([s.noise for s in samples])))
+    names = ("image", "bright", "known", "normal", "shown")
+    image, bright, known, normal, shown = (np.concatenate([getattr(s, name) for s in samples]) for name in names)
+    return _Sampled(image, bright, known, normal, float(np.median([s.noise for s in samples])), shown)
 
 
 def _in_frame(samples: list[_Sampled], capture: Capture, frame: Frame) -> list[_Sampled]:
@@ -323,11 +332,11 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
         found = _one_rig(capture, caster, samples, separate, residual, generator, seed)
         if found is not None:
             return found
-    if is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator):
+    if is_glossy([s.highlights for s in samples], [s.normal for s in samples], generator):
         lamps = _glossy_lamps(capture, samples) if may_share else None
         if lamps is not None:
             return Calibration(_assemble(capture, [lamps] * len(samples), True, fixed=True), residual, fourth, True)
-        scaled = [glossy_lights(s.absolute, s.normal) for s in samples]
+        scaled = [glossy_lights(s.highlights, s.normal) for s in samples]
         return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
     each = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
     left_open = any(is_open for _, is_open in each)
@@ -348,7 +357,7 @@ def _one_rig(
     together = factorise(pooled.image, pooled.known, 3, floor=pooled.noise)
     alike = together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
     left, fourth = together.residual, float(together.singular_values[3])
-    metallic = is_glossy([pooled.absolute], [pooled.normal], generator)
+    metallic = is_glossy([pooled.highlights], [pooled.normal], generator)
     lamps = _glossy_lamps(capture, samples) if metallic else None
     if lamps is not None:
         return Calibration(_assemble(capture, [lamps] * len(samples), True, fixed=True), left, fourth, True)
@@ -358,7 +367,7 @@ def _one_rig(
     if not (alike or frame or flat):
         return None
     if metallic:
-        rig, left_open = glossy_lights(pooled.absolute, pooled.normal), False
+        rig, left_open = glossy_lights(pooled.highlights, pooled.normal), False
     else:
         factors = None if frame == "world" or not (alike or flat) else together
         rig, left_open = _scaled_lights(factors, _in_frame(samples, capture, frame or "camera"))
@@ -369,7 +378,7 @@ def _one_rig(
 def _glossy_lamps(capture: Capture, samples: list[_Sampled]) -> Float | None:
     """Lights of a glossy surface that stand still in the world, where they do (correlation.py)."""
     rotations = [view.camera.rotation for view in capture.views]
-    return lamps_of_a_glossy_surface([s.absolute for s in samples], [s.normal for s in samples], rotations)
+    return lamps_of_a_glossy_surface([s.highlights for s in samples], [s.normal for s in samples], rotations)
 
 
 def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
@@ -377,7 +386,7 @@ def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
     generator = np.random.default_rng(seed)
     caster, normal = ray_caster(surface), vertex_normals(surface)
     samples = [_sampled(view, caster, normal, generator) for view in capture.views]
-    return is_glossy([s.absolute for s in samples], [s.normal for s in samples], generator)
+    return is_glossy([s.highlights for s in samples], [s.normal for s in samples], generator)
 
 
 def _assemble(capture: Capture, scaled: list[Float], one_rig: bool, fixed: bool = False) -> Lights:

@@ -74,13 +74,20 @@ def shading(normal: Float, light: Float, glossy: bool, towards: Float = TOWARDS_
 
 
 def _standardised(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    away = values - values.mean(0)
+    """Columns less their means, of length one; what is NaN says nothing."""
+    unknown = np.isnan(values)
+    if unknown.any():
+        known = np.where(unknown, 0, values)
+        away = np.where(unknown, 0, known - known.sum(0) / np.maximum((~unknown).sum(0), 1)).astype(np.float32)
+    else:
+        away = values - values.mean(0)
     unit: NDArray[np.float32] = away / np.maximum(np.linalg.norm(away, axis=0), np.finfo(np.float32).tiny)
     return unit
 
 
 def searched(image: Float, normal: Float, glossy: bool, count: int = ALL_AROUND) -> tuple[Float, Float]:
-    """Direction (lights, 3), camera frame, and correlation (lights,) for values (n, lights) of pixels with normals (n, 3)."""
+    """Direction (lights, 3), camera frame, and correlation (lights,) for values (n, lights), NaN where unknown, of pixels with normals
+    (n, 3)."""
     candidates = directions(count)
     root = _standardised(np.sqrt(np.maximum(image, 0)).astype(np.float32))
     correlation = _standardised(shading(normal, candidates, glossy)).T @ root
@@ -138,7 +145,7 @@ def _of_intensity(direction: Float, image: Float, shaded: NDArray[np.float32]) -
     lit = shaded > LIT * (1 + BODY)
     ratio = np.where(lit, image / np.where(lit, shaded, 1), np.nan)
     # A light that lights nothing well has the others' mean.
-    known = lit.any(0)
+    known = (lit & ~np.isnan(image)).any(0)
     level = np.full(len(direction), np.nan)
     level[known] = np.nanmedian(ratio[:, known], axis=0)
     good = known & (np.nan_to_num(level) > 0)

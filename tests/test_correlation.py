@@ -71,6 +71,10 @@ def test_lamps_around_a_metal_that_stand_still_while_the_camera_moves() -> None:
     assert found is not None and angles_deg(normalise(found), lamps).mean() < 5
     level = np.linalg.norm(found, axis=1) / INTENSITY
     assert level.std() / level.mean() < 0.15
+    images = [photographed_from(R, lamps) for R in ROTATIONS]
+    images[2][:, 3:5] = np.nan
+    without = lamps_of_a_glossy_surface(images, [NORMAL] * 6, ROTATIONS)
+    assert without is not None and angles_deg(normalise(without), lamps).mean() < 5
     # A rig that moves with the camera, lights that are others in every view, and normals that are none tell no such lamps.
     assert lamps_of_a_glossy_surface([photographed(20.0, 0.0)] * 6, [NORMAL] * 6, ROTATIONS) is None
     others = [photographed_from(R, normalise(RNG.normal(size=(12, 3)))) for R in ROTATIONS]
