@@ -103,6 +103,6 @@ def shared_frame(capture: Capture, caster: RayCaster, generator: np.random.Gener
         lambda normal, group: _left(of, normal, group, noise), (of.normal, of.in_camera, of.normal), (of.view, one, one)
     )
     less, more = sorted((with_camera, in_world))
-    if less > EXPLAINED * apart or more < TOLD_APART * less:
-        return None
-    return "world" if in_world < with_camera else "camera"
+    if less <= EXPLAINED * apart and more > TOLD_APART * less:
+        return "world" if in_world < with_camera else "camera"
+    return None

@@ -16,6 +16,7 @@ from mvps.hull import bounds, default_cells, hull_of_masks, signed_distance, vis
 from mvps.mesh import normalise, piece_count, vertex_normals
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
+from mvps.sharing import shared_frame
 from mvps.silhouette import mask_distance
 from mvps.synthetic.scene import Scene, make_cameras, make_lights, render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -164,6 +165,12 @@ def test_whose_few_lights_are(scene: SphereScene, count: int, seed: int | None, 
     error = np.mean([degrees(a, b[:count]).mean() for a, b in zip(found.direction, truth.direction, strict=True)])
     # A lamp in the world lights no vertex twice from another side: that one half is darker may be the lamp's doing as well.
     assert error < (10 if lamps else 2) or not found.one_rig
+
+
+def test_black_photographs_tell_of_no_rig(scene: SphereScene) -> None:
+    capture, _, surface = lambertian(scene)
+    black = replace(capture, views=tuple(replace(view, samples=0 * view.samples) for view in capture.views))
+    assert shared_frame(black, RayCaster(surface), np.random.default_rng(0)) is None
 
 
 def test_lights_survive_a_rough_shape_that_is_wrong_on_one_side(scene: SphereScene) -> None:
