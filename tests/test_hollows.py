@@ -123,7 +123,7 @@ def with_surface(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
     monkeypatch.setattr("mvps.hollows.dug", lambda *_, **__: None)
     monkeypatch.setattr("mvps.hollows.solid", lambda *_: None)
-    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: surface)
+    monkeypatch.setattr("mvps.hull.visual_hull", lambda *_: surface)
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_pits_stay_that_halve_what_is_left_unexplained_in_them(
 
     monkeypatch.setattr("mvps.digging.stage_two", lambda *_: refined())
     monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
-    monkeypatch.setattr("mvps.hull.visual_hull", lambda _: wide)
+    monkeypatch.setattr("mvps.hull.visual_hull", lambda *_: wide)
     found, grid = refined(), SignedDistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 2.0)
     best, rounds = pitted(capture, grid, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
     assert next(counted) - 2 == made and len(rounds) == kept and (best is found) == (kept == 0)

@@ -174,6 +174,7 @@ def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> 
     refined = SimpleNamespace(**vars(rough) | {"surface": "refined"})
     monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    monkeypatch.setattr("mvps.mesh.piece_count", lambda _: 1)
     of_turn = SimpleNamespace(rounds=[SimpleNamespace(fusions=0)])
     for lights, surface in ((1, "refined"), (3, "refined"), (4, "hull")):
         capture = SimpleNamespace(views=[SimpleNamespace(lights=tuple(range(lights)))])
@@ -241,7 +242,7 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
         one = {"residual": residual, "light_change_deg": turned, "vertex_change_px": 1.0}
         # A round done again, under lights that hardly turn any more.
         rounds = [one, {**one, "light_change_deg": 0.1 * turned}]
-        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, rounds=rounds)
+        return SimpleNamespace(lights=None, maps=(), law=None, carried=None, surface="field", rounds=rounds)
 
     def one(_: object, __: object, plan: OccupancySettings, *___: object) -> None:
         trained.append(plan.steps)
@@ -249,6 +250,7 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
     monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined(*next(made)))
     monkeypatch.setattr("mvps.coarse.stage_one", one)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
+    monkeypatch.setattr("mvps.mesh.piece_count", lambda _: 1)
     last, rounds = in_turn(None, None, refined(0.3, 5.0), Settings("somewhere"), None, None, "")  # type: ignore[arg-type]
     assert trained == [OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
     assert [r["residual"] for r in rounds[::2]] == list(residuals[:turns]) and last.rounds[0]["residual"] == residuals[turns - 1]
