@@ -34,7 +34,7 @@ LIGHTS = 8
 
 NEAR = 0.004
 """Slope that a photographed object in a light stage leaves (0.006, docs/method.md), less its error; lights at ten times the object's size
-leave 0.014, sound captures -0.02 to 0.004, but for light between surfaces."""
+leave 0.014, sound captures -0.02 to 0.003 but for light between surfaces, and for one of metal."""
 
 
 class Nearness(NamedTuple):

@@ -7,8 +7,9 @@ Lambert's law on vertices j of a rough surface with normals n_j, under light l o
 Robust least squares for a and s in turn, three times: s_il of each view on its own; s_il = s_l in the cameras' frames; s_il = s_l in the
 world's. A rough shape's normals are off, and so all three leave much; but with s_l in a frame in which the lights move, or of lights that
 are others in every view, far more. What tells them apart is that a vertex has one albedo: a view alone would explain anything by albedo.
-On hulls of captures whose views share lights these leave 0.9 to 1.6 times as much as lights of each view's own (median over samples);
-where they share none 1.7 to 4 times, of metals, whose highlights hide what normals tell, 1.2 and 1.4 (docs/findings/lights.md).
+On hulls of captures whose views share lights these leave 0.9 to 1.5 times as much as lights of each view's own (median over samples), with
+two exceptions up to 1.7; where they share none 1.7 to 4 times, of metals, whose highlights hide what normals tell, 1.2 and 1.4
+(docs/findings/lights.md).
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from mvps.joint.grey import grey_lights
 from mvps.joint.held_out import carried_over, fit_lights
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import observe
-from mvps.joint.patches import Patches
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.rendering import photograph
@@ -51,7 +50,6 @@ def test_lamps_come_back_to_the_truth_with_one_direction_in_all_views() -> None:
     lights = [DirectionalLights(torch.tensor(aside, dtype=torch.float32), truth[0].intensity)] * len(truth)
     rotations = [torch.tensor(rig_frame(lamps, view.camera), dtype=torch.float32) for view in capture.views]
     anchor = free_reflectance(torch.tensor(vertex_normals(r.surface), dtype=torch.float32), 0.3, 3)
-    patches: Patches
     views, vertices, anchor, patches = in_patches(r.surface, views, vertices, anchor)
     for _ in range(8):
         lights, law = light_step(views, vertices, lights, law, anchor, patches, rotations, True)

@@ -198,6 +198,7 @@ def test_the_page_says_what_was_captured(scene: SphereScene) -> None:
     }
     assert facts(scene, settings={"calibrated_lights": True})["Lights"].endswith("; taken from the capture&#x27;s calibration")
     r = scene.reconstruction
+    assert "one rig that stands still in the world while the camera moves" in facts(scene, lights=replace(r.lights, fixed=True))["Lights"]
     fewer = Lights((r.lights.direction[0][:4], *r.lights.direction[1:]), (r.lights.intensity[0][:4], *r.lights.intensity[1:]), False)
     told = facts(scene, lights=fewer, light_names=((1, 2, 3, 4), *r.light_names[1:]), settings={})
     assert (told["Photographs"], told["Lights"]) == ("54", "4 to 10 a view: other ones in every view")
