@@ -10,12 +10,16 @@ sum_p rho(|A b'_p / |A b'_p| - n_p|). rho redescends and its scale shrinks (grad
 a hull's normals are exact near the silhouettes and far off in concavities.
 
 Where all views are under the same lights (one rig), all pixels of all views are factorised together. That is decided by the data: pooled,
-the variance that the factors leave must not double against separate factorisations. Of a view that shows three flat sides three factors
-explain anything, and its normals fix no A: from most views so, one rig is believed. A is fixed where the second eigenvalue of the 9 x 9
-matrix over its inliers, at the solved A, is above what the last scale of rho lets pass; where it is not, albedo a_p and s_l are solved in
-turn in
+the variance that the factors leave must not double against separate factorisations, and what other views say of a light must be what a
+view says itself (correlation.py): of metals, and of four lights, factors leave as much either way. Of a view that shows three flat sides
+three factors explain anything, and its normals fix no A: from most views so, one rig is believed. A is fixed where the second eigenvalue of
+the 9 x 9 matrix over its inliers, at the solved A, is above what the last scale of rho lets pass; where it is not, albedo a_p and s_l are
+solved in turn in
 
     I_pl = a_p (n_p . s_l)+     for the rough shape's normals as they are.
+
+So they are where views then say more alike of the same places (between_views.py): the hull of few views has wrong normals all over, which
+fix A wrongly, and factors of samples of which many are in shadow may be no factors of the images.
 
 Factors know no frame. Whether a rig stands still with the camera or in the world, while the camera moves, is told by which of the two
 leaves less under the rough shape's normals and one albedo at every vertex (sharing.py). Nor do factors find lights that most pixels of a
@@ -37,11 +41,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mvps.between_views import nearer, said
 from mvps.cores import on_cores
-from mvps.correlation import glossy_lights, is_glossy, lamps_of_a_glossy_surface
+from mvps.correlation import alike_in_all_views, glossy_lights, is_glossy, lamps_of_a_glossy_surface
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface, View
-from mvps.sharing import Frame, shared_frame
+from mvps.sharing import Frame, shared_frame, vertex_samples
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
 
@@ -66,6 +71,9 @@ ROUGH_NORMAL, FINE_NORMAL = 0.3, 0.05
 down to the error of Lambertian normals on glossy objects. Between them the pixels where the hull is not the surface are outvoted."""
 
 AMBIGUITY_SWEEPS = 20
+
+PIXELS_FOR_THE_OTHER = 4000
+"""Of all views, from which a rig under the rough shape's normals is found, to be held against that of the factors."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,13 @@ class _Sampled:
         """(n, lights) radiance."""
         absolute: Float = self.image * self.bright[:, None]
         return absolute
+
+    def part(self, most: int) -> _Sampled:
+        """The first pixels of them."""
+        few = slice(most)
+        return replace(
+            self, image=self.image[few], bright=self.bright[few], known=self.known[few], normal=self.normal[few], shown=self.shown[few]
+        )
 
     @property
     def highlights(self) -> Float:
@@ -339,8 +354,11 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
         scaled = [glossy_lights(s.highlights, s.normal) for s in samples]
         return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
     each = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
-    left_open = any(is_open for _, is_open in each)
-    return Calibration(_assemble(capture, [scaled for scaled, _ in each], False), residual, fourth, under_normals=left_open)
+    first, left_open = [scaled for scaled, _ in each], any(is_open for _, is_open in each)
+    others = _nearer(capture, caster, samples, first, False, np.random.default_rng(seed))
+    left_open |= any(other is not None for other in others)
+    first = [scaled if other is None else other for scaled, other in zip(first, others, strict=True)]
+    return Calibration(_assemble(capture, first, False), residual, fourth, under_normals=left_open)
 
 
 def _one_rig(
@@ -355,15 +373,16 @@ def _one_rig(
     """Lights that all views share, None where they share none; residual: what separate factors leave."""
     pooled = _pooled(samples)
     together = factorise(pooled.image, pooled.known, 3, floor=pooled.noise)
-    alike = together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
     left, fourth = together.residual, float(together.singular_values[3])
     metallic = is_glossy([pooled.highlights], [pooled.normal], generator)
+    told = alike_in_all_views([s.highlights for s in samples], [s.normal for s in samples], metallic)
+    alike = told is not False and together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
     lamps = _glossy_lamps(capture, samples) if metallic else None
     if lamps is not None:
         return Calibration(_assemble(capture, [lamps] * len(samples), True, fixed=True), left, fourth, True)
     # Highlights hide what normals tell.
     frame = None if metallic else shared_frame(capture, caster, np.random.default_rng(seed))
-    flat = not alike and frame is None and not _mostly_fixed(separate, samples)
+    flat = told is not False and not alike and frame is None and not _mostly_fixed(separate, samples)
     if not (alike or frame or flat):
         return None
     if metallic:
@@ -371,8 +390,32 @@ def _one_rig(
     else:
         factors = None if frame == "world" or not (alike or flat) else together
         rig, left_open = _scaled_lights(factors, _in_frame(samples, capture, frame or "camera"))
+        if factors is not None and not left_open:
+            few = max(PIXELS_FOR_THE_OTHER // len(samples), 1)
+            some = [s.part(few) for s in samples]
+            other = _nearer(capture, caster, some, [rig] * len(some), True, np.random.default_rng(seed))[0]
+            rig, left_open = (rig, False) if other is None else (other, True)
     lights = _assemble(capture, [rig] * len(samples), True, frame == "world")
     return Calibration(lights, left, fourth, metallic, flat, left_open)
+
+
+def _nearer(
+    capture: Capture, caster: RayCaster, samples: list[_Sampled], first: list[Float], one_rig: bool, generator: np.random.Generator
+) -> list[Float | None]:
+    """Per view the lights (lights, 3) under the rough shape's normals, where views are clearly nearer to each other under them than under
+    the first ones (lights, 3), None where not. Of one rig the views' first lights are the same, and so are these."""
+    try:
+        other = [_scaled_lights(None, samples)[0]] * len(samples) if one_rig else on_cores(lambda s: _scaled_lights(None, [s])[0], samples)
+    except CaptureError:
+        # Normals in a plane say nothing of lights across it.
+        return [None] * len(samples)
+    of = vertex_samples(capture, caster, generator)
+
+    def said_under(lights: list[Float]) -> list[Float]:
+        return on_cores(lambda part, s, view: said(part, s, view.camera, view.scale), of, lights, capture.views)
+
+    chosen = nearer(of, said_under(first), said_under(other), one_rig)
+    return [lights if is_other else None for lights, is_other in zip(other, chosen, strict=True)]
 
 
 def _glossy_lamps(capture: Capture, samples: list[_Sampled]) -> Float | None:

@@ -46,6 +46,10 @@ two kinds. So much better than lights that stand still with the camera they must
 TOLD = 0.5
 """Least correlation that tells anything: of a sheet, whose hull has none of its normals, it is 0.3 whatever is true."""
 
+TOLD_BY_OTHERS = 2 / 3
+"""Of what a view says of its lights, from which the other views say the same: 0.74 and more where they share lights, up to 0.62 where they
+do not (two exceptions, 0.71 and 0.84; docs/findings/lights.md)."""
+
 
 def sphere(count: int) -> Float:
     """(count, 3) evenly spread directions (Fibonacci's spiral)."""
@@ -109,6 +113,22 @@ def glossy_lights(image: Float, normal: Float) -> Float:
     """(lights, 3) intensity times direction, camera frame, of a glossy surface."""
     direction, _ = searched(image, normal, True)
     return _of_intensity(direction, image, shading(normal, direction, True))
+
+
+def alike_in_all_views(images: list[Float], normals: list[Float], glossy: bool) -> bool | None:
+    """Whether lights that stand still with the camera are the same in all views; None where correlation tells nothing. images: per view
+    (n, lights), two lights or more; normals: (n, 3), camera frame."""
+    few, candidates = max(FEW_PIXELS // len(images), 1), directions(FEW_DIRECTIONS)
+    of_views = []
+    for image, normal in zip(images, normals, strict=True):
+        root = _standardised(np.sqrt(np.maximum(image[:few], 0)).astype(np.float32))
+        of_views.append(_standardised(shading(normal[:few], candidates, glossy)).T @ root)
+    everywhere, count = np.sum(of_views, axis=0), images[0].shape[1]
+    said = np.stack([correlation[(everywhere - correlation).argmax(0)] for correlation in of_views])
+    own = float(np.einsum("vll->", said)) / (len(said) * count)
+    other = (float(said.sum()) / len(said) - own * count) / (count * (count - 1))
+    best = float(np.mean([correlation.max(0) for correlation in of_views]))
+    return own - other > TOLD_BY_OTHERS * (best - other) if best > TOLD else None
 
 
 def lamps_of_a_glossy_surface(images: list[Float], normals: list[Float], rotations: list[Float]) -> Float | None:

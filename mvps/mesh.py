@@ -204,20 +204,20 @@ def unbiased(surface: Surface) -> Surface:
 def isotropic_remesh(surface: Surface, edge_length: float, iterations: int = 2) -> Surface:
     """The surface with edges of about `edge_length` (split, collapse, flip, relax: Botsch and Kobbelt 2004). Edges across which
     the surface turns by KNIFE_EDGE stay edges, and vertices on them stay there. Of what falls apart as many pieces stay as there were."""
+    import igl
     from gpytoolbox import remesh_botsch
 
     vertices: Any
-    # A face without area has no normal, and its edges are no knife's.
-    with np.errstate(invalid="ignore"):
-        vertices, faces = remesh_botsch(
-            np.array(surface.vertices),
-            np.array(surface.faces, dtype=np.int32),
-            i=iterations,
-            h=edge_length,
-            project=True,
-            detect_feature_edges=True,
-            feature_dihedral_threshold=KNIFE_EDGE,
-        )
+    # gpytoolbox finds the same edges of a closed mesh, in as much time as a third of the remeshing takes.
+    sharp = igl.sharp_edges(np.array(surface.vertices), np.array(surface.faces, dtype=np.int64), np.radians(KNIFE_EDGE))
+    vertices, faces = remesh_botsch(
+        np.array(surface.vertices),
+        np.array(surface.faces, dtype=np.int32),
+        i=iterations,
+        h=edge_length,
+        project=True,
+        feature_edges=np.unique(np.sort(sharp, axis=1), axis=0),
+    )
     return largest_pieces(Surface(vertices, faces), piece_count(surface))
 
 

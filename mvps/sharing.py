@@ -43,7 +43,7 @@ TOLD_APART = 1.5
 Frame = Literal["camera", "world"]
 
 
-class _Samples(NamedTuple):
+class VertexSamples(NamedTuple):
     """Of vertices in views: vertex (n,), its number among those looked at; view (n,); normal (n, 3), world, and in the camera's frame;
     image (n, lights) grey radiance; known (n, lights) neither clipped nor in shadow."""
 
@@ -55,22 +55,24 @@ class _Samples(NamedTuple):
     known: Bool
 
 
-def _samples(view: View, number: int, caster: RayCaster, among: Int) -> _Samples:
+def _of_view(view: View, number: int, caster: RayCaster, among: Int, most: int) -> VertexSamples:
     chosen = among[visible_vertices(caster, view.camera)[among]]
     image, _ = project(view.camera, caster.surface.vertices[chosen])
     row, column = np.floor(image[:, ::-1]).astype(int).T
     pixel = view.pixel_index[row, column]
     chosen, pixel = chosen[pixel >= 0], pixel[pixel >= 0]
-    lights = slice(None, None, max(1, len(view.lights) // LIGHTS))
+    lights = slice(None, None, max(1, len(view.lights) // most))
     samples = view.samples[pixel][:, lights]
     values = samples.astype(np.float64).mean(-1) * view.scale
     bright = np.quantile(values, BRIGHT, axis=0) if len(values) else 0.0
     known = (samples < view.saturation).all(-1) & (values > DARK * bright)
     normal = caster.vertex_normals[chosen]
-    return _Samples(np.searchsorted(among, chosen), np.full(len(chosen), number), normal, normal @ view.camera.rotation.T, values, known)
+    return VertexSamples(
+        np.searchsorted(among, chosen), np.full(len(chosen), number), normal, normal @ view.camera.rotation.T, values, known
+    )
 
 
-def _left(of: _Samples, normal: Float, group: NDArray[np.int64], noise: float) -> float:
+def _left(of: VertexSamples, normal: Float, group: NDArray[np.int64], noise: float) -> float:
     """Median of what is left of samples of vertices that several views see, by lights s of views grouped by `group` (n,)."""
     groups, count = int(group.max()) + 1, int(of.vertex.max()) + 1
     lights, albedo, weight = np.zeros((groups, of.image.shape[1], 3)), np.ones(count), of.known.astype(np.float64)
@@ -91,12 +93,17 @@ def _left(of: _Samples, normal: Float, group: NDArray[np.int64], noise: float) -
     return float(np.median(np.abs(residual)[told])) if told.any() else np.inf
 
 
+def vertex_samples(capture: Capture, caster: RayCaster, generator: np.random.Generator, most: int | None = None) -> list[VertexSamples]:
+    """What each view shows of some of the vertices, under about `most` of its lights."""
+    among = np.sort(generator.permutation(len(caster.surface.vertices))[:VERTICES])
+    return [_of_view(view, number, caster, among, most or len(view.lights)) for number, view in enumerate(capture.views)]
+
+
 def shared_frame(capture: Capture, caster: RayCaster, generator: np.random.Generator) -> Frame | None:
     """In which frame one rig of lights explains the views of a capture, whose lights have the same numbers, on a rough surface; None where
     none does, or both do."""
-    among = np.sort(generator.permutation(len(caster.surface.vertices))[:VERTICES])
-    of_views = [_samples(view, number, caster, among) for number, view in enumerate(capture.views)]
-    of = _Samples(*(np.concatenate(parts) for parts in zip(*of_views, strict=True)))
+    of_views = vertex_samples(capture, caster, generator, LIGHTS)
+    of = VertexSamples(*(np.concatenate(parts) for parts in zip(*of_views, strict=True)))
     if not len(of.vertex):
         return None
     noise, one = float(np.mean([view.scale for view in capture.views])), np.zeros_like(of.view)

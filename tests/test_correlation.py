@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mvps.correlation import TOWARDS_CAMERA, directions, glossy_lights, is_glossy, lamps_of_a_glossy_surface, searched, sphere
+from mvps.correlation import (
+    TOWARDS_CAMERA,
+    alike_in_all_views,
+    directions,
+    glossy_lights,
+    is_glossy,
+    lamps_of_a_glossy_surface,
+    searched,
+    sphere,
+)
 from mvps.mesh import angles_deg, normalise
 
 RNG = np.random.default_rng(0)
@@ -81,3 +90,15 @@ def test_lamps_around_a_metal_that_stand_still_while_the_camera_moves() -> None:
     assert lamps_of_a_glossy_surface(others, [NORMAL] * 6, ROTATIONS) is None
     wrong = normalise(RNG.normal(size=NORMAL.shape))
     assert lamps_of_a_glossy_surface([photographed_from(R, lamps) for R in ROTATIONS], [wrong] * 6, ROTATIONS) is None
+
+
+def test_whether_views_of_a_metal_share_lights_that_move_with_the_camera() -> None:
+    alike, views = photographed(20.0, 0.0), len(ROTATIONS)
+    assert alike_in_all_views([alike] * views, [NORMAL] * views, True) is True
+    # Of what was left out nothing is said.
+    without = alike.copy()
+    without[:, 3] = np.nan
+    assert alike_in_all_views([alike, without, alike], [NORMAL] * 3, True) is True
+    others = [photographed_from(np.eye(3), normalise(np.column_stack([RNG.normal(0, 0.6, (12, 2)), -np.ones(12)]))) for _ in ROTATIONS]
+    assert alike_in_all_views(others, [NORMAL] * views, True) is False
+    assert alike_in_all_views([alike] * views, [normalise(RNG.normal(size=NORMAL.shape))] * views, True) is None

@@ -73,6 +73,8 @@ def _lights() -> Iterator[tuple[str, Callable[[], Sample]]]:
     for count in (1, 2, 3, 4, 8):
         yield f"lights-{count}", partial(of_scene, replace(BASE, lights=count))
     yield "lights-free", partial(of_scene, replace(BASE, free_lights=True))
+    metal = partial(scenes.made_of, albedo=0.0, weight=(0.4, 1.0), sharpness=(12.0, 90.0))
+    yield "lights-free-metal", partial(of_scene, replace(BASE, free_lights=True, exposure=0.98), change=metal)
     yield "lights-fixed", partial(of_scene, change=partial(scenes.lamps, count=24))
     yield "lights-fixed-3", partial(of_scene, change=partial(scenes.lamps, count=3))
     yield "lights-cone-15-deg", partial(of_scene, replace(BASE, spread=15.0))

@@ -113,21 +113,18 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
 def _without_blur(normal: Float, blur: Float, error: Float, known: Bool, surface: Surface) -> Float:
     """Normals (F, 3), unit, without their blur (F,); error (F,) of theirs along a tangent, NaN where not known."""
     centre = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0)
-    around, over_some = partial(_mean_around, surface=surface), partial(_around, known=known, surface=surface)
-    corners = np.repeat(np.arange(len(normal)), 3), surface.faces.ravel()
-    held = sp.csr_matrix((np.ones(3 * len(normal), np.float32), corners), (len(normal), len(surface.vertices)))
-    beside = held @ held.T
+    corners = surface.faces.ravel(), np.arange(0, surface.faces.size + 1, 3)
+    held = sp.csr_matrix((np.ones(surface.faces.size), *corners), (len(normal), len(surface.vertices)))
+    around, over_some, beside = partial(_mean_around, held=held), partial(_around, known=known, surface=surface), held @ held.T
     once = sharpened(normal, centre, blur, error, around, over_some)
     # What turns by no more than lights may be off is no edge.
     return within(once, sharpened(once, centre, blur, error + SHARED_SIGMA**2, around, over_some), beside)
 
 
-def _mean_around(values: Float, surface: Surface) -> Float:
-    """(F, k) means over the faces at a face's corners, corner by corner, of values (F, k)."""
-    corners, count = surface.faces.ravel(), len(surface.vertices)
-    number = np.maximum(np.bincount(corners, minlength=count), 1)
-    of_vertices = np.stack([np.bincount(corners, np.repeat(of, 3), count) for of in values.T], 1) / number[:, None]
-    mean: Float = of_vertices[surface.faces].mean(1)
+def _mean_around(values: Float, held: sp.csr_matrix) -> Float:
+    """(F, k) means over the faces at a face's corners, corner by corner, of values (F, k). held (F, V): 1 where a vertex is a corner."""
+    number = np.maximum(np.bincount(held.indices, minlength=held.shape[1]), 1)
+    mean: Float = held @ (held.T @ values / number[:, None]) / 3
     return mean
 
 
