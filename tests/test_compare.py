@@ -79,8 +79,14 @@ def test_a_comparison_that_is_ended_ends_its_method_and_goes_on_later(capture: P
     command = [sys.executable, "-m", "mvps.compare", str(capture), "--methods", "hull", "--out", str(tmp_path / "out"), "--quiet"]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+
+    def runs_method(pid: str) -> bool:
+        # Libraries look for others by programs of their own, which nobody waits for.
+        place = Path(f"/proc/{pid}/cmdline")
+        return place.exists() and b"mvps.methods" in place.read_bytes()
+
     end = time.monotonic() + 60
-    while not (child := children.read_text().split()) and time.monotonic() < end:
+    while not (child := [pid for pid in children.read_text().split() if runs_method(pid)]) and time.monotonic() < end:
         time.sleep(0.02)
     process.terminate()
     assert process.wait(60) == 128 + signal.SIGTERM and child and not Path(f"/proc/{child[0]}").exists()
