@@ -101,7 +101,7 @@ class Calibration:
         if math.isnan(self.residual):
             return f"{kind}, from the rough shape's normals"
         kind += ", which do not tell them one by one" if self.assumed else ""
-        kind += ", from the rough shape's normals where these leave them open" if self.under_normals else ""
+        kind += ", from the rough shape's normals where factors are not believed" if self.under_normals else ""
         return f"{kind}; three factors leave {100 * self.residual:.1f} % of the images"
 
 
