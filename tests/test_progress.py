@@ -115,6 +115,9 @@ def test_a_stage_that_fails_is_not_recorded_and_says_so(level: logging.Logger, m
     assert sys.stderr.getvalue().splitlines()[-1] == "hull: 0.0 s, stopped before its end"
 
 
-def test_without_logging_set_up_nothing_is_shown(capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_logging_set_up_nothing_is_shown(level: logging.Logger, capsys: pytest.CaptureFixture[str]) -> None:
+    # As in a program that never did: other tests have.
+    level.handlers = []
+    level.setLevel(logging.NOTSET)
     steps()
     assert capsys.readouterr().err == ""
