@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mvps.mesh import lengths
 from mvps.scene import Camera, Float, Int
 from mvps.sharing import VertexSamples
 from solvers.low_rank import robust_weights, solve_rows
@@ -75,7 +76,8 @@ def _mean(vertex: Int, values: Float, views: Int) -> Float:
 
 
 def _lengths(vectors: Float) -> Float:
-    length: Float = np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
+    """(n,) of vectors (n, 3), never zero."""
+    length: Float = np.maximum(lengths(vectors), np.finfo(float).tiny)
     return length
 
 

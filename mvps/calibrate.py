@@ -394,7 +394,7 @@ def _one_rig(
             few = max(PIXELS_FOR_THE_OTHER // len(samples), 1)
             some = [s.part(few) for s in samples]
             other = _nearer(capture, caster, some, [rig] * len(some), True, np.random.default_rng(seed))[0]
-            rig, left_open = (rig, False) if other is None else (other, True)
+            rig, left_open = (rig if other is None else other), other is not None
     lights = _assemble(capture, [rig] * len(samples), True, frame == "world")
     return Calibration(lights, left, fourth, metallic, flat, left_open)
 

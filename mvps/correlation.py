@@ -89,11 +89,16 @@ def _standardised(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return unit
 
 
+def _roots(image: Float) -> NDArray[np.float32]:
+    """Standardised square roots of values (n, lights)."""
+    return _standardised(np.sqrt(np.maximum(image, 0)).astype(np.float32))
+
+
 def searched(image: Float, normal: Float, glossy: bool, count: int = ALL_AROUND) -> tuple[Float, Float]:
     """Direction (lights, 3), camera frame, and correlation (lights,) for values (n, lights), NaN where unknown, of pixels with normals
     (n, 3)."""
     candidates = directions(count)
-    root = _standardised(np.sqrt(np.maximum(image, 0)).astype(np.float32))
+    root = _roots(image)
     correlation = _standardised(shading(normal, candidates, glossy)).T @ root
     best = correlation.argmax(0)
     return candidates[best], correlation[best, np.arange(image.shape[1])].astype(float)
@@ -121,8 +126,7 @@ def alike_in_all_views(images: list[Float], normals: list[Float], glossy: bool) 
     few, candidates = max(FEW_PIXELS // len(images), 1), directions(FEW_DIRECTIONS)
     of_views = []
     for image, normal in zip(images, normals, strict=True):
-        root = _standardised(np.sqrt(np.maximum(image[:few], 0)).astype(np.float32))
-        of_views.append(_standardised(shading(normal[:few], candidates, glossy)).T @ root)
+        of_views.append(_standardised(shading(normal[:few], candidates, glossy)).T @ _roots(image[:few]))
     everywhere, count = np.sum(of_views, axis=0), images[0].shape[1]
     said = np.stack([correlation[(everywhere - correlation).argmax(0)] for correlation in of_views])
     own = float(np.einsum("vll->", said)) / (len(said) * count)
@@ -155,7 +159,7 @@ def _in_world(normals: list[Float], rotations: list[Float], light: Float) -> NDA
 
 def _correlation(images: list[Float], normals: list[Float], rotations: list[Float], candidates: Float) -> NDArray[np.float32]:
     """(candidates, lights) of all views' pixels together."""
-    root = _standardised(np.sqrt(np.maximum(np.concatenate(images), 0)).astype(np.float32))
+    root = _roots(np.concatenate(images))
     found: NDArray[np.float32] = _standardised(_in_world(normals, rotations, candidates)).T @ root
     return found
 
