@@ -68,6 +68,8 @@ CASES = {
     "coin-patina": Case("coin", "patina", SceneSettings(seed=64)),
     "steps-cloth": Case("steps", "cloth", SceneSettings(seed=65)),
     "gear-copper": Case("gear", "copper", SceneSettings(seed=66)),
+    "nut-copper": Case("nut", "copper", SceneSettings(seed=322)),
+    "bricks-copper": Case("bricks", "copper", SceneSettings(seed=323, lights=16, spread=70)),
     "lumps-inlaid": Case(201, "inlaid", SceneSettings(seed=201)),
     "lumps-contrast": Case(202, "contrast", SceneSettings(seed=202, lights=16)),
     "statue-enamel": Case("statue", "enamel", SceneSettings(seed=204, views=12)),

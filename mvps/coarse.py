@@ -28,11 +28,6 @@ GOOD_HULL = 0.2
 """Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
 captures, docs/findings/stage_one.md), so it would do no better."""
 
-MOVING_DEG = 1.0
-"""Mean turn of the lights in a round from which on the field has seen other lights than there are: wrong by a degree, they bend normals by
-as much. Where the model fits, lights of eight captures turned by 0.06 to 0.9 deg, and by 3.8 where four views leave the hull four pixels
-off (docs/findings/stage_one.md)."""
-
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
 long as the residual falls."""
@@ -106,6 +101,7 @@ def in_turn(
     is trained again from these while the model fits badly or lights turn, as long as the residual falls.
     """
     from mvps.device import chosen_device
+    from mvps.joint.refine import MOVING_DEG
     from mvps.material import POOR_FIT
     from mvps.mesh import piece_count
     from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from mvps.checks.ambient import ambient, ambient_share
+from mvps.checks.radiometry import is_metal
 from mvps.scene import Capture, View
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
+
+from hard.scenes import made_of, rendered, shaped_as, surface_of
 
 
 @cache
@@ -64,6 +72,17 @@ def test_inter_reflection_is_none() -> None:
         sent = 0.1 * np.median(view.samples, axis=0, keepdims=True) + 0.9 * view.samples
         views.append(replace(view, samples=np.rint(sent).astype(np.uint16)))
     assert ambient_share(Capture("lit", tuple(views))) == 0
+
+
+@pytest.mark.parametrize(("sides", "weight", "sharpness"), [(6, (1.0,), (8.0,)), (6, (0.6, 0.6), (5.0, 30.0)), (5, (1.0,), (8.0,))])
+def test_tails_of_lobes_on_flat_sides_are_none(sides: int, weight: tuple[float, ...], sharpness: tuple[float, ...]) -> None:
+    settings = SceneSettings(views=8, lights=10, size=96)
+    prism = surface_of(trimesh.creation.cylinder(0.6, 0.8, sections=sides))
+    capture = rendered(settings, lambda _: made_of(shaped_as(prism, settings), 0.0, weight, sharpness))[0]
+    # Three factors, which say nothing of metals, fit as many normals as these.
+    assert not is_metal(capture)
+    after, found = ambient(capture)
+    assert after is capture and not found
 
 
 def test_few_lights_say_nothing() -> None:

@@ -91,3 +91,19 @@ def test_vertices_that_have_far_to_go_have_not_settled(scene: SphereScene, monke
         told.append(refined_from(scene, 0.5, plan))
     assert told[0].status == "not settled" and "px to go in the mean" in told[0].text
     assert "px to go in the mean" not in told[1].text
+
+
+def test_where_lights_and_vertices_still_move_in_the_last_round_they_have_not_settled(
+    scene: SphereScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = RefineSettings((RoundSettings(3.0, REACH, 0.4),) * 2)
+    first, second = refined_from(scene, 0.5, plan).rounds
+    # First lights are no rounds'.
+    assert first["lights_moving_deg"] == 0 < second["lights_moving_deg"] == second["light_change_deg"]
+    told = []
+    for of_lights, of_vertices in ((0.5, 0.5), (2.0, 0.5), (0.5, 2.0)):
+        monkeypatch.setattr("mvps.joint.refine.MOVING_DEG", of_lights * second["lights_moving_deg"])
+        monkeypatch.setattr("mvps.joint.refine.MOVING_PIXELS", of_vertices * second["vertex_change_px"])
+        told.append(refined_from(scene, 0.5, plan))
+    assert told[0].status == "not settled"
+    assert ["In the last round lights still turned" in one.text for one in told] == [True, False, False]

@@ -8,7 +8,12 @@ bright level among the shadowed samples of light l, and L_l the light's own leve
 
 A low quantile, because the rest of shadows is penumbra, and noise that is cut at black has half of its values there. Ambient light is
 believed where a is more than LEAST and more than twice what k explains, in the median of the views, and the object is no metal, of which
-three factors say nothing.
+three factors say nothing. Where sides are flat three factors fit a metal too, and what they take for shadows are the tails of its lobes.
+These differ from lamp to lamp, where ambient light is the same under all: among the shadowed samples of one pixel
+
+    q = (median deviation from their median) / median
+
+is no more than SAME, in the median of the pixels. And they are not stronger under weaker lamps, k > -a / 4.
 
 Taken off: c_p over the bright level as a linear function of b_p / |b_p|, per channel, fitted to the medians of the pixels' shadowed
 samples. Ambient light from everywhere falls on a surface smoothly by its direction; what concavities keep out is not modelled.
@@ -46,8 +51,11 @@ LOW = 0.1
 LEAST = 0.01
 """Of a, in bright levels: lights then are off by a third of a degree (docs/findings/checks.md), as much as by all else."""
 
-FEWEST_SHADOWS, FEWEST_OF_LIGHT = 50, 10
-"""Shadowed samples of a view, and of a light, below which they say nothing."""
+FEWEST_SHADOWS, FEWEST_OF_LIGHT, FEWEST_OF_PIXEL = 50, 10, 3
+"""Shadowed samples of a view, of a light and of a pixel, below which they say nothing."""
+
+SAME = 0.2
+"""Largest q of ambient light: up to 0.19 of a hundredth of the bright level, 0.23 to 0.6 on most metals (docs/findings/checks.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,32 +87,35 @@ def _factors(view: View, chosen: NDArray[np.int64], s: Float | None = None) -> _
     return _Factors(b, bright, s, level, (b @ s.T < -SHADOWED * level) & view.shown, image)
 
 
-def _line(view: View) -> tuple[float, float]:
-    """a and k times the mean level; NaN where shadows are too few."""
+def _line(view: View) -> tuple[float, float, float]:
+    """a, k times the mean level, and q; NaN where shadows are too few."""
     chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
     f = _factors(view, chosen)
-    count = f.shadowed.sum(0)
+    count, several = f.shadowed.sum(0), f.shadowed.sum(1) >= FEWEST_OF_PIXEL
     enough = count >= FEWEST_OF_LIGHT
-    if count.sum() < FEWEST_SHADOWS or enough.sum() < 3:
-        return float("nan"), float("nan")
+    if count.sum() < FEWEST_SHADOWS or enough.sum() < 3 or not several.any():
+        return float("nan"), float("nan"), float("nan")
     M = f.image / f.bright
     low = np.array([np.quantile(M[f.shadowed[:, k], k], LOW) for k in np.flatnonzero(enough)])
     level = f.level[enough]
     weight = np.sqrt(count[enough])
     columns = np.column_stack([np.ones_like(level), level]) * weight[:, None]
     a, k = np.linalg.lstsq(columns, low * weight, rcond=None)[0]
-    return float(a), float(k * level.mean())
+    dark = np.where(f.shadowed, M, np.nan)[several]
+    middle = np.nanmedian(dark, axis=1, keepdims=True)
+    q = np.nanmedian(np.abs(dark - middle), axis=1) / np.maximum(middle[:, 0], np.finfo(np.float64).tiny)
+    return float(a), float(k * level.mean()), float(np.median(q))
 
 
 def ambient_share(capture: Capture) -> float:
     """a of the module's docstring; 0 where it is not to be believed or cannot be told."""
     enough = [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
-    lines = np.array(on_cores(_line, enough)).reshape(-1, 2)
+    lines = np.array(on_cores(_line, enough)).reshape(-1, 3)
     told = np.isfinite(lines[:, 0])
     if not told.any() or told.mean() < 0.5:
         return 0.0
-    a, k = np.median(lines[told], axis=0)
-    return float(a) if a > LEAST and a > 2 * abs(k) else 0.0
+    a, k, q = np.median(lines[told], axis=0)
+    return float(a) if a > LEAST and -a / 4 < k < a / 2 and q <= SAME else 0.0
 
 
 def _taken_off(view: View) -> View:

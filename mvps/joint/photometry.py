@@ -88,7 +88,7 @@ def _lit(state: State, capture: Capture, few: list[ViewSamples], part: tuple[Cap
 def photometric_round(
     state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
 ) -> dict[str, float]:
-    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed."""
+    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed. First lights do not count as moving."""
     device = task.device
     part, part_lights = thinned(capture, state.lights)
     state.gathers = {}
@@ -129,8 +129,7 @@ def photometric_round(
         vertices, unknown = with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
     solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
-    moved = _light_change(state.lights, solved)
-    state.lights = solved
+    moved, state.lights = _light_change(state.lights, solved), solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
     vertices = vertex_step(state.views, vertices, lights, state.law, free, stated=False)
     last = vertices.normal
@@ -147,6 +146,7 @@ def photometric_round(
     return {
         "residual": float(relative_residuals(state.views, vertices).nanmedian()),
         "light_change_deg": moved[0],
+        "lights_moving_deg": 0.0 if carried is None else moved[0],
         "intensity_change": moved[1],
         "normal_change_deg": float(np.mean(turned)),
         "light_step_deg": light_step,

@@ -51,6 +51,15 @@ STILL_DEG = 0.25
 """Mean turn of the lights in their last Gauss-Newton step below which they have settled: near a minimum steps at least halve, so that all
 further ones together are no longer than this."""
 
+MOVING_DEG = 1.0
+"""Mean turn of the lights in a round from which on what came before has seen other lights than there are: wrong by a degree, they bend
+normals by as much. Where the model fits, lights of eight captures turned by 0.06 to 0.9 deg after Stage I, and by 3.8 where four views
+leave the hull four pixels off (docs/findings/stage_one.md)."""
+
+MOVING_PIXELS = 0.5
+"""Mean move of the vertices in the last round from which on, where lights move too, neither has found its place: 0.37 at most in runs that
+came out right, 0.56 to 0.73 in five that did not (docs/findings/stage_one.md)."""
+
 STILL = 0.5
 """The same for the normals' median turn, over their median standard error: further steps are lost in it."""
 
@@ -331,6 +340,12 @@ def _settled(account: list[dict[str, float]]) -> tuple[str, str]:
         return "not settled", (
             f"In the last step normals still turned by {last['last_step_deg']:.2f} deg (settled below {enough:.2f}, half their standard"
             f" error), lights by {last['light_step_deg']:.2f} deg (settled below {enough_light:.2f}); a finer preset does more rounds."
+        )
+    if last["lights_moving_deg"] > MOVING_DEG and last["vertex_change_px"] > MOVING_PIXELS:
+        return "not settled", (
+            f"In the last round lights still turned by {last['lights_moving_deg']:.1f} deg and vertices moved by"
+            f" {last['vertex_change_px']:.2f} px (settled below {MOVING_DEG:g} or {MOVING_PIXELS}): the shape was found under other"
+            " lights; more views help, or lights that all views share."
         )
     if last["left_px"] > AT_REST_PIXELS:
         return "not settled", (
