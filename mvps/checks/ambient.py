@@ -13,7 +13,7 @@ These differ from lamp to lamp, where ambient light is the same under all: among
 
     q = (median deviation from their median) / median
 
-is no more than SAME, in the median of the pixels. And they are not stronger under weaker lamps, k > -a / 4.
+is no more than SAME, in the median of the pixels. And tails count for more under weaker lamps, k < 0, ambient light does not: k > -a / 4.
 
 Taken off: c_p over the bright level as a linear function of b_p / |b_p|, per channel, fitted to the medians of the pixels' shadowed
 samples. Ambient light from everywhere falls on a surface smoothly by its direction; what concavities keep out is not modelled.
