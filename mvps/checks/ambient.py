@@ -13,7 +13,7 @@ These differ from lamp to lamp, where ambient light is the same under all: among
 
     q = (median deviation from their median) / median
 
-is no more than SAME, in the median of the pixels. And tails count for more under weaker lamps, k < 0, ambient light does not: k > -a / 4.
+is no more than SAME, in the median of the pixels.
 
 Taken off: c_p over the bright level as a linear function of b_p / |b_p|, per channel, fitted to the medians of the pixels' shadowed
 samples. Ambient light from everywhere falls on a surface smoothly by its direction; what concavities keep out is not modelled.
@@ -55,7 +55,7 @@ FEWEST_SHADOWS, FEWEST_OF_LIGHT, FEWEST_OF_PIXEL = 50, 10, 3
 """Shadowed samples of a view, of a light and of a pixel, below which they say nothing."""
 
 SAME = 0.2
-"""Largest q of ambient light: up to 0.19 of a hundredth of the bright level, 0.23 to 0.6 on most metals (docs/findings/checks.md)."""
+"""Largest q of ambient light: up to 0.22 at a hundredth of the bright level, 0.23 to 0.6 on most metals (docs/findings/checks.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ def ambient_share(capture: Capture) -> float:
     if not told.any() or told.mean() < 0.5:
         return 0.0
     a, k, q = np.median(lines[told], axis=0)
-    return float(a) if a > LEAST and -a / 4 < k < a / 2 and q <= SAME else 0.0
+    return float(a) if a > LEAST and a > 2 * abs(k) and q <= SAME else 0.0
 
 
 def _taken_off(view: View) -> View:
