@@ -4,8 +4,8 @@
 
 CASES are below, all of them if none is named. CAPTURES is the folder that holds the captures; `large` is made for the purpose
 where it is not there, and thrown away. Writes accuracy-PRESET.json and accuracy-PRESET.md beside this file (accuracy-PRESET-cuda on
-CUDA), where cases of earlier runs stay: errors against ground truth (which the reconstruction never reads), seconds of the whole
-command, and its largest resident set, with the machine named.
+CUDA) as each case is done, where cases of earlier runs stay: errors against ground truth (which the reconstruction never reads),
+seconds of the whole command, and its largest resident set, with the machine named.
 """
 
 from __future__ import annotations
@@ -178,6 +178,20 @@ def machines(rows: list[dict[str, Any]]) -> str:
     return "; ".join(f"{name} ({', '.join(some)})" if len(cases) > 1 else name for name, some in cases.items())
 
 
+def kept(row: dict[str, Any], preset: str, device: str) -> str:
+    """The row beside those of earlier runs, as JSON and as a table; its line of the table."""
+    suffix, option = ("", "") if device == "cpu" else (f"-{device}", f" --device {device}")
+    stem = HERE / f"accuracy-{preset}{suffix}"
+    record, page = stem.with_suffix(".json"), stem.with_suffix(".md")
+    before = json.loads(record.read_text(encoding="utf-8"))["rows"] if record.exists() else []
+    found = {one["case"]: one for one in (*before, row)}
+    rows = [found[name] for name in CASES if name in found]
+    record.write_text(json.dumps({"preset": preset, "rows": rows}, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    command = f"python benchmarks/accuracy.py CAPTURES --preset {preset}{option}"
+    page.write_text(f"`{command}` on {machines(rows)}; s is the median of the runs.\n\n{table(rows)}\n", encoding="utf-8")
+    return table([row]).splitlines()[-1]
+
+
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -187,21 +201,10 @@ def main() -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where torch computes")
     parser.add_argument("--repeats", type=int, default=1, help="runs of each case; the table says how many, and has their median time")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        made = [measure(name, given.captures, given.preset, given.device, Path(folder), given.repeats) for name in given.cases or CASES]
-    rows = [row | {"machine": machine(given.device)} for row in made]
-    suffix, option = ("", "") if given.device == "cpu" else (f"-{given.device}", f" --device {given.device}")
-    stem = HERE / f"accuracy-{given.preset}{suffix}"
-    if stem.with_suffix(".json").exists():
-        before = {row["case"]: row for row in json.loads(stem.with_suffix(".json").read_text(encoding="utf-8"))["rows"]}
-        found = before | {row["case"]: row for row in rows}
-        rows = [found[name] for name in CASES if name in found]
-    record = {"preset": given.preset, "rows": rows}
-    stem.with_suffix(".json").write_text(json.dumps(record, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-    command = f"python benchmarks/accuracy.py CAPTURES --preset {given.preset}{option}"
-    text = f"`{command}` on {machines(rows)}; s is the median of the runs.\n\n{table(rows)}\n"
-    stem.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(text)
+    for name in given.cases or CASES:
+        with tempfile.TemporaryDirectory() as folder:
+            row = measure(name, given.captures, given.preset, given.device, Path(folder), given.repeats)
+        print(kept(row | {"machine": machine(given.device)}, given.preset, given.device), flush=True)
 
 
 if __name__ == "__main__":
