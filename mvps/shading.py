@@ -38,6 +38,9 @@ GRAZING_POWER = 3
 QUADRATURE = 64
 """Nodes of Gauss and Legendre: enough for sharpness up to 10^4."""
 
+DARKEST = 0.01
+"""Least share of what it receives that the median point of an object returns: black paint and velvet return 1 to 5 %."""
+
 FAINTEST = -30.0
 """Least logarithm of a Gaussian lobe's value: 1e-13 of its peak no photograph shows, and the value's square is still a normal number in
 float32. Below that processors take ten times as long over every product (docs/findings/cost.md)."""
@@ -120,6 +123,14 @@ def returned(sharpness: tuple[float, ...], microfacet: bool) -> NDArray[np.float
     gained = gain(torch.from_numpy(2 * u)).numpy()
     values = (lobe(torch.from_numpy(u), s, microfacet)[0].numpy() for s in sharpness)
     return np.array([1.0, *(4 * (1 - low) * float(weight @ (gained * value * (2 * u**2 - 1) * u)) for value in values)])
+
+
+def most_albedo(reflectance: Tensor, law: Law) -> float:
+    """What no albedo of an object exceeds whose points have reflectance (n, 1 + lobes), albedo and weights: no surface returns more than
+    all, and the median point DARKEST of it at least. Infinite where nothing is reflected."""
+    of_all = reflectance.double() @ torch.from_numpy(returned(law.sharpness, law.microfacet)).to(reflectance.device)
+    usual = float(of_all.median()) if len(of_all) else 0.0
+    return usual / DARKEST if usual else np.inf
 
 
 def against(vectors: Tensor, light: Tensor) -> Tensor:

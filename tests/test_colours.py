@@ -83,6 +83,23 @@ def test_without_samples_albedo_is_unknown_and_lobes_are_white() -> None:
         assert np.isnan(albedo).all() and (tint == 1).all()
 
 
+def test_an_albedo_that_no_surface_has_is_unknown() -> None:
+    """A vertex that is taken to be all but dark, and is not, would return a hundred thousand times what it receives."""
+    of, ratios, albedo = observed(WHITE)
+    others = [replace(samples, data=torch.zeros_like(samples.data)) for samples in of.views[1:]]
+    towards = of.lights[0].direction.double()
+    away = -torch.nn.functional.normalize(towards.sum(0), dim=0)
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        share = (low + high) / 2
+        normal = torch.nn.functional.normalize((1 - share) * away + share * towards[0], dim=0)
+        low, high = (share, high) if (towards @ normal).max() < 1e-5 else (low, share)
+    normals, dark = of.vertices.normal.clone(), int(of.views[0].vertex[len(of.views[0].vertex) // 2])
+    normals[dark] = normal.float()
+    found, _ = colours(of._replace(views=[of.views[0], *others], vertices=replace(of.vertices, normal=normals)), ratios, LobeColour.WHITE)
+    assert np.isnan(found[dark]).all() and np.nanmax(found) < 2 * albedo.max()
+
+
 def test_what_coloured_walls_send_is_not_taken_for_their_own_colour() -> None:
     """In grey the walls of a bowl come out too red, by what red walls send them; about a third of that is left where it has their colour
     (0.055 and 0.019)."""

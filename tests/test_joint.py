@@ -28,7 +28,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.shown import OWN_SHARE
 from mvps.joint.state import State
 from mvps.joint.stated import scatter, stated_errors
-from mvps.joint.steps import LEAST_NOISE, SCALE_FLOOR, _least_scale, free_reflectance, vertex_step, with_population
+from mvps.joint.steps import LEAST_NOISE, SCALE_FLOOR, _least_scale, free_reflectance, possible, vertex_step, with_population
 from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
 from mvps.joint.vertices import fuse
 from mvps.material import Model
@@ -79,6 +79,18 @@ def test_vertices_find_normals_and_reflectance_from_the_meshs_normals(scene: Sph
     # The seam between the two colours is mixed by interpolation; away from it the albedo is what was rendered.
     away = np.abs(scene.reconstruction.surface.vertices[:, 0]) > 5
     assert np.median(np.abs(state.reflectance[:, 0] - truth.reflectance[:, 0]).numpy()[away]) < 0.02
+
+
+@pytest.mark.parametrize("lobes", [0.0, 8.0])
+def test_an_albedo_that_no_surface_has_is_taken_to_be_the_usual_one(lobes: float) -> None:
+    """White on black may be ninety times as bright, a thousand times nothing is; what metals return by lobes counts as well."""
+    albedo = torch.tensor([0.01] * 9 + [0.9, 10.0, 2e6])
+    reflectance = torch.stack([albedo, torch.full_like(albedo, lobes)], 1)
+    said = torch.ones_like(reflectance)
+    said[8] = 0
+    found = possible(Vertices(torch.zeros(12, 3), reflectance, albedo, said=said), Law((32.0,))).reflectance
+    assert torch.equal(found[:10], reflectance[:10]) and torch.equal(found[:, 1], reflectance[:, 1])
+    assert found[11, 0] == np.float32(0.01) and found[10, 0] == np.float32(10.0 if lobes else 0.01)
 
 
 def test_normal_equations_do_not_depend_on_which_thread_was_faster(scene: SphereScene) -> None:

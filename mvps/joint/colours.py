@@ -56,6 +56,7 @@ from mvps.joint.trial import parted
 from mvps.material import Trial, judged
 from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Float
+from mvps.shading import most_albedo
 
 BOUND_SWEEPS = 4
 """Of the formulas for a and t in turn: which vertices have no body settles in two or three."""
@@ -210,13 +211,17 @@ def lobes_in_colour(of: Observed, ratios: Sequence[Float], some: torch.Tensor) -
 
 
 def colours(of: Observed, ratios: Sequence[Float], kind: LobeColour, sent: Senders | None = None) -> tuple[Float, Float]:
-    """Albedo (V, 3), NaN where no view sees the vertex, and the lobes' colour (V, 3), under lights of known channel ratios (lights, 3).
+    """Albedo (V, 3), NaN where no view sees the vertex or none could be that strong, and the lobes' colour (V, 3), under lights of known
+    channel ratios (lights, 3).
 
     sent: what diffuse surfaces send light on by, in colour; None: what arrives counts as grey.
     """
     sums = _sums(of, ratios, partial(chunks, of), sent)
     tint = _of_kind(kind, sums)
-    return np.where(sums.qq > 0, _albedo(sums, tint), np.nan), tint
+    albedo = _albedo(sums, tint)
+    seen = sums.qq.any(1)
+    known = (sums.qq > 0) & (albedo.mean(1, keepdims=True) <= most_albedo(of.vertices.reflectance[torch.from_numpy(seen)], of.law))
+    return np.where(known, albedo, np.nan), tint
 
 
 def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:

@@ -16,7 +16,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio
 from mvps.joint.patches import Patches
 from mvps.joint.reflectance import Observed
 from mvps.joint.state import State
-from mvps.joint.steps import Anchor, vertex_step
+from mvps.joint.steps import Anchor, possible, vertex_step
 from mvps.mesh import angles_deg, edges, lengths
 from mvps.scene import Capture, Lights, Surface
 
@@ -94,7 +94,7 @@ def with_bounce(state: State, vertices: Vertices, lights: list[DirectionalLights
     if left == unknown:
         return vertices, unknown
     # Albedo that was solved without what arrives from other surfaces is too large, and the bounce too small for it.
-    vertices = vertex_step(state.views, vertices, lights, law, free, stated=False)
+    vertices = possible(vertex_step(state.views, vertices, lights, law, free, stated=False), law)
     state.law, left = told_by_shadows(state.views, vertices, lights, law, unknown, state.noise)
     return vertices, left
 

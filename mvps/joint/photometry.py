@@ -25,7 +25,7 @@ from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.state import State, grey_albedo, lit_by, material_of, relative_residuals, senders_of
-from mvps.joint.steps import free_reflectance, lambert_albedo, vertex_step, vertex_steps, with_population
+from mvps.joint.steps import free_reflectance, lambert_albedo, possible, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
 from mvps.mesh import angles_deg, vertex_normals
 from mvps.scene import Capture, CaptureError, Lights, Surface
@@ -133,7 +133,7 @@ def photometric_round(
     lights = grey_lights(thinned(capture, state.lights)[1], device)
     vertices = vertex_step(state.views, vertices, lights, state.law, free, stated=False)
     last = vertices.normal
-    vertices = vertex_step(state.views, vertices, lights, state.law, free)
+    vertices = possible(vertex_step(state.views, vertices, lights, state.law, free), state.law)
     state.vertices = vertices
     state.lights = with_colours(state, capture, few, patches.vertex)
     state.under = thinned(capture, state.lights)

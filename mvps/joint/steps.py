@@ -18,6 +18,7 @@ from mvps.joint.blocks import DirectionalLights, NormalEquations, Vertices, tang
 from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches, held
 from mvps.scene import RELIABLE, Law
+from mvps.shading import most_albedo
 from solvers.least_squares import bounded_step, columns_of_inverse
 
 LARGEST_TURN = 0.3
@@ -121,13 +122,25 @@ def vertex_step(
     return Vertices(normal, (vertices.reflectance + step[:, 2:]).clamp_min(0), vertices.scale, sigma, said)
 
 
+def possible(vertices: Vertices, law: Law) -> Vertices:
+    """The vertices, after a step, with the median albedo where theirs is more than any surface's: light that the model does not know falls
+    there, as on vertices that it takes to be all but dark. They would send as much to others."""
+    assert vertices.said is not None
+    albedo, told = vertices.reflectance[:, :1], vertices.said[:, 0] > 0
+    beyond = albedo > most_albedo(vertices.reflectance[told], law)
+    if not bool(beyond.any()):
+        return vertices
+    within = torch.where(beyond, albedo[told].median(), albedo)
+    return replace(vertices, reflectance=torch.cat([within, vertices.reflectance[:, 1:]], 1))
+
+
 def vertex_steps(
     views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, anchor: Anchor, steps: int
 ) -> Vertices:
-    """So many steps; sigma as of the last."""
+    """So many steps, to what is possible; sigma as of the last."""
     for k in range(steps):
         vertices = vertex_step(views, vertices, lights, law, anchor, stated=k == steps - 1)
-    return vertices
+    return possible(vertices, law)
 
 
 def _least_scale(scale: Tensor, albedo: Tensor) -> float:
