@@ -219,8 +219,8 @@ def colours(of: Observed, ratios: Sequence[Float], kind: LobeColour, sent: Sende
     sums = _sums(of, ratios, partial(chunks, of), sent)
     tint = _of_kind(kind, sums)
     albedo = _albedo(sums, tint)
-    seen = sums.qq.any(1)
-    known = (sums.qq > 0) & (albedo.mean(1, keepdims=True) <= most_albedo(of.vertices.reflectance[torch.from_numpy(seen)], of.law))
+    seen = torch.from_numpy(sums.qq.any(1)).to(of.vertices.reflectance.device)
+    known = (sums.qq > 0) & (albedo.mean(1, keepdims=True) <= most_albedo(of.vertices.reflectance[seen], of.law))
     return np.where(known, albedo, np.nan), tint
 
 
