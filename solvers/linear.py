@@ -17,7 +17,7 @@ TOLERANCE = 1e-5
 """Of the residual in `nearby`, relative: on meshes of 47 000 and 89 000 vertices three fusions then end 2e-3 pixels off at most."""
 
 MOST_STEPS = 40
-"""A nearby matrix needs a handful, on five captures 23 at most; 40 take as long as a factor on meshes of half a million vertices."""
+"""A nearby matrix needs a handful, on four captures 23 at most; 40 take as long as a factor on meshes of half a million vertices."""
 
 
 class CholeskyLike:
