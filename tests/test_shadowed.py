@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from mvps.joint.patches import Patches, drawn_patches
 from mvps.joint.photometry import Task, photometric_round
 from mvps.joint.shadowed import bounce_in_shadow
 from mvps.joint.state import State
-from mvps.joint.steps import Anchor, free_reflectance
+from mvps.joint.steps import Anchor, free_reflectance, vertex_step
 from mvps.joint.trial import held_out_errors
 from mvps.material import Model, presumed
 from mvps.mesh import normalise, vertex_normals
@@ -127,6 +128,20 @@ def test_rounds_on_the_true_surface_come_to_the_true_strength(seen: Seen, wrong:
         assert state.vertices is not None
         photometric_round(state, seen.capture, task, (seen.surface, state.vertices), generator)
     assert abs(state.law.bounce / BOUNCE - 1) < 0.03
+
+
+def test_where_hardly_a_sample_counts_a_round_states_a_right_angle(seen: Seen, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Infinity is no number of metrics.json: a result was refused at its end."""
+
+    def untold(*args: Any, **kwargs: Any) -> Vertices:
+        step = vertex_step(*args, **kwargs)
+        known = torch.arange(len(step.normal)) % 10 == 0
+        return step if step.sigma is None else replace(step, sigma=torch.where(known, step.sigma, torch.inf))
+
+    monkeypatch.setattr("mvps.joint.photometry.vertex_step", untold)
+    state = State(seen.surface, seen.lights, (), replace(DIFFUSE, bounce=BOUNCE), Model(bounce=True), 0.0, vertices=seen.vertices)
+    task, generator = Task(False, False, False, True, True, CPU), np.random.default_rng(0)
+    assert photometric_round(state, seen.capture, task, (seen.surface, seen.vertices), generator)["stated_error_deg"] == 90
 
 
 def with_noise(seen: Seen, samples: list[ViewSamples], sigma: float, lit_within: bool) -> list[ViewSamples]:
