@@ -2,9 +2,9 @@
 
     python benchmarks/one_view.py CAPTURES [CASE ...] [--preset standard]
 
-CAPTURES holds ball and bear, photographed, and bunny, armadillo and spot, of which single views are taken; made objects are made. Mesh
-normals are left out: of single views of several, the truth has more than the view shows. Writes one_view.json and one_view.md beside this
-file, where cases of earlier runs stay.
+CAPTURES holds ball and bear, photographed, and bunny, armadillo, spot and buddha, of which single views are taken; made objects are made.
+Mesh normals are left out: of single views of several, the truth has more than the view shows. Writes one_view.json and one_view.md beside
+this file, where cases of earlier runs stay.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ CASES: dict[str, tuple[str, list[str]]] = {
     **{f"bunny, view {view}": ("bunny", ["--views", str(view)]) for view in (1, 7, 13)},
     **{f"armadillo, view {view}": ("armadillo", ["--views", str(view)]) for view in (1, 7)},
     **{f"spot, view {view}": ("spot", ["--views", str(view)]) for view in (1, 8)},
+    **{f"buddha, view {view}": ("buddha", ["--views", str(view)]) for view in (1, 7)},
 }
 """Name: capture, and options of mvps.reconstruct, or for made ones of mvps.synthetic."""
 

@@ -54,6 +54,13 @@ def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved
     return variance
 
 
+def disagreement(normal: Float, rough: Float) -> Float:
+    """(pixels,) variance of a normal along a tangent, radians^2, of normals (pixels, 3) where rough ones (pixels, 3) are all that told the
+    lights: of the square of their difference half is either's error, and half of that of either tangential component. One number for all:
+    where two guesses meet, they may both be wrong."""
+    return np.full(len(normal), ((normal - rough) ** 2).sum(1).mean() / 4)
+
+
 def at_corners(variance: Float, surface: Surface) -> Float:
     """(V,) values of the pixels (n,) at the corners of their quads (relief/surface.py): means over the faces around."""
     corners, of_faces = surface.faces.ravel(), np.repeat(np.tile(variance, 2), 3)

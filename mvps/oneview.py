@@ -2,6 +2,7 @@
 
 factorisation -> 3 x 3 ambiguity (relief/ambiguity.py) -> photometric stereo -> rounds of bas-relief, integration and Stage II
 (joint/one_view.py), each but the first from the ambiguity on, without highlights -> the same result as of many views.
+Where nothing resolves the ambiguity, lights are those under the inflated silhouette's normals, from which the rounds start.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from mvps.scene import Capture, CaptureError, Float, Lights, NormalMap, Reconstr
 
 if TYPE_CHECKING:
     from mvps.device import Device
+    from mvps.joint.refine import Refined
     from mvps.plan import Parts
     from mvps.reconstruct import Settings
     from mvps.relief.ambiguity import Resolved
@@ -67,11 +69,11 @@ def surface_of(view: View, normal: Float, confidence: Float, distance: float) ->
     return pixel_surface(view.camera, view.pixels, local, depth, distance)
 
 
-def first_lights(capture: Capture, seed: int) -> tuple[Lights, Resolved]:
-    """Lights of the capture's only view by factorisation, with its ambiguity resolved up to what lobes say later, and what resolved it."""
+def first_lights(capture: Capture, rough: Float, seed: int) -> tuple[Lights, Resolved | None]:
+    """Lights of the capture's only view by factorisation, with its ambiguity resolved up to what lobes say later, and what resolved it;
+    those under the rough normals (pixels, 3) of its inflated silhouette where nothing did (None)."""
     from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, solve_ambiguity
-    from mvps.relief.ambiguity import Resolved, factors, resolved
-    from mvps.relief.silhouette import inflated_normals
+    from mvps.relief.ambiguity import factors, first_resolved, lights_under
 
     view = capture.views[0]
     if len(view.lights) < MINIMUM_LIGHTS:
@@ -80,16 +82,35 @@ def first_lights(capture: Capture, seed: int) -> tuple[Lights, Resolved]:
             f" {len(view.lights)}; add photographs, views or --calibrated-lights"
         )
     generator = np.random.default_rng(seed)
-    pseudo, rough = factors(view, generator), inflated_normals(view.mask)
+    pseudo, under = factors(view, generator), lights_under(view, rough)
     try:
-        A = resolved(view, pseudo, rough, solve_ambiguity(pseudo.left, rough, pseudo.weight), generator)
+        found = first_resolved(view, pseudo, rough, solve_ambiguity(pseudo.left, rough, pseudo.weight), under, generator)
     except np.linalg.LinAlgError as error:
         raise CaptureError(
             f"{capture.name}: wanted photographs whose lights span three directions, given ones where {error};"
             " use other lights or --calibrated-lights"
         ) from error
-    found = Resolved(pseudo, rough, A)
-    return _lights(view, found, colour_ratios(view)), found
+    return lights_of_silhouette(view, rough) if found is None else _lights(view, found.lights, colour_ratios(view)), found
+
+
+def lights_of_silhouette(view: View, rough: Float) -> Lights:
+    """The view's lights under the rough normals (pixels, 3) of its inflated silhouette."""
+    from mvps.calibrate import colour_ratios
+    from mvps.relief.ambiguity import lights_under
+
+    return _lights(view, lights_under(view, rough), colour_ratios(view))
+
+
+def words_of(found: Resolved | None) -> str:
+    """How the lights of one view were found."""
+    if found is None:
+        return "one view, whose photographs do not tell them: from the silhouette's normals"
+    return f"one view; three factors leave {100 * found.pseudo.residual:.1f} % of the images"
+
+
+def of_silhouette(maps: NormalMap, rough: Float, view: View) -> NormalMap:
+    """The view's maps with the rough normals (pixels, 3), camera frame, of its inflated silhouette."""
+    return replace(maps, normal=(rough @ view.camera.rotation).astype(np.float32))
 
 
 def lights_again(view: View, lights: Lights, rough: Float, seed: int) -> tuple[Lights, Resolved]:
@@ -100,14 +121,14 @@ def lights_again(view: View, lights: Lights, rough: Float, seed: int) -> tuple[L
     strength = lights.intensity[0].mean(1, keepdims=True)
     pseudo = factors_under(view, lights.direction[0] @ view.camera.rotation.T * strength)
     found = Resolved(pseudo, rough, resolved(view, pseudo, rough, np.eye(3), np.random.default_rng(seed)))
-    return _lights(view, found, lights.intensity[0] / strength), found
+    return _lights(view, found.lights, lights.intensity[0] / strength), found
 
 
-def _lights(view: View, found: Resolved, colour: Float) -> Lights:
-    """Lights of what was resolved; colour (lights, 3) of their intensities, mean one."""
+def _lights(view: View, scaled: Float, colour: Float) -> Lights:
+    """Lights of intensity times direction (lights, 3), camera frame; colour (lights, 3) of their intensities, mean one."""
     from mvps.calibrate import normalised, without_gaps
 
-    scaled = without_gaps(found.lights)
+    scaled = without_gaps(scaled)
     strength = np.linalg.norm(scaled, axis=1, keepdims=True)
     return normalised([scaled / strength @ view.camera.rotation], [strength * colour], True)
 
@@ -155,6 +176,57 @@ def without_misfits(capture: Capture, lights: Lights, device: Device) -> tuple[C
     return capture.without({view.name: wrong}), [Finding("photograph", f"{view.name}/{n:03d}", words, True) for n in wrong]
 
 
+def refined_from(
+    used: Capture, lights: Lights, found: Resolved | None, solved: bool, rough: Float, settings: Settings, parts: Parts, progress: Progress
+) -> tuple[Refined, Capture, list[Finding]]:
+    """Stage II of the only view of `used` under its first lights, what it was made from, and photographs that were left out.
+
+    found: what resolved the lights; None where they are the silhouette's (solved), from whose rough normals (pixels, 3) rounds then start,
+    or given ones (not solved).
+    """
+    from mvps.device import chosen_device
+    from mvps.jackknife import at_corners, disagreement, shared_variance
+    from mvps.joint.one_view import ROUNDS, Start, refine_view
+    from mvps.joint.refine import RefineSettings
+    from mvps.photometric import normal_maps
+
+    device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
+    distance, untold = distance_of(view)[0], solved and found is None
+    with progress.stage("photometric stereo") as stage:
+        # Under lights that are the silhouette's alone no photograph can be told to be wrong, and Lambert's normals are worse than its own.
+        used, misfits = (used, []) if untold else without_misfits(used, lights, device)
+        maps = normal_maps(used, lights, device)[0]
+        start = Start(lights, of_silhouette(maps, rough, view) if untold else maps, found)
+        stage.status(f"{len(misfits)} photographs left out" if misfits else "")
+    # Where the model does not fit, rounds turn the silhouette's lights away.
+    plan = parts.of(RefineSettings((), free_lights=found is not None, final=True))
+    with progress.stage("joint refinement", total=rounds) as stage:
+
+        def on_round(_: int, changes: dict[str, float]) -> None:
+            stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg")})
+
+        def integrated(normal: Float, confidence: Float) -> Surface:
+            return surface_of(view, normal, confidence, distance)
+
+        def again(matt: View, before: Lights, maps: NormalMap) -> Start[Resolved | None]:
+            if untold:
+                return Start(before, maps, None)
+            lights, anew = (before, None) if found is None else lights_again(matt, before, rough, settings.seed)
+            return Start(lights, normal_maps(replace(used, views=(matt,)), lights, device)[0], anew)
+
+        refined, start = refine_view(used, start, again, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
+        if solved:
+            if start.resolved is None:
+                shared = disagreement(refined.maps[0].normal @ view.camera.rotation.T, rough)
+            else:
+                shared = shared_variance(used.views[0], start.lights, start.maps, start.resolved, parts.law(), settings.seed, device)
+            confidence = less_confident(refined.material.confidence, at_corners(shared, refined.surface))
+            refined = replace(refined, material=replace(refined.material, confidence=confidence))
+        undone = len(refined.rounds) + 1
+        stage.status(refined.status + (f"; round {undone} fitted much worse and was undone" if undone <= rounds else ""))
+    return refined, used, misfits
+
+
 def reconstruct_view(
     capture: Capture,
     used: Capture,
@@ -167,44 +239,24 @@ def reconstruct_view(
 ) -> Reconstruction:
     """A reconstruction from the only view of `used`; the rest as in reconstruct.reconstruct."""
     from mvps.device import chosen_device
-    from mvps.jackknife import at_corners, shared_variance
-    from mvps.joint.one_view import ROUNDS, Start, refine_view
-    from mvps.joint.refine import RefineSettings
     from mvps.outcome import all_lights, normal_pictures, told
-    from mvps.photometric import normal_maps
+    from mvps.relief.ambiguity import FAR_DEG, away_deg, lights_under
+    from mvps.relief.silhouette import inflated_normals
 
-    device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
-    distance, words = distance_of(view)
+    device, view = chosen_device(settings.device), used.views[0]
+    words, rough = distance_of(view)[1], inflated_normals(view.mask)
     with progress.stage("lights") as stage:
-        lights, found = (given, None) if given is not None else first_lights(used, settings.seed)
-        left = f"one view; three factors leave {100 * found.pseudo.residual:.1f} % of the images" if found else ""
-        stage.status(left or "given with the capture")
-    with progress.stage("photometric stereo") as stage:
-        used, misfits = without_misfits(used, lights, device)
-        start = Start(lights, normal_maps(used, lights, device)[0], found)
-        stage.status(f"{len(misfits)} photographs left out" if misfits else "")
-    plan = parts.of(RefineSettings((), free_lights=given is None, final=True))
-    with progress.stage("joint refinement", total=rounds) as stage:
-
-        def on_round(_: int, changes: dict[str, float]) -> None:
-            stage.advance(1, **{k: v for k, v in changes.items() if k in ("residual", "light_change_deg")})
-
-        def integrated(normal: Float, confidence: Float) -> Surface:
-            return surface_of(view, normal, confidence, distance)
-
-        def again(matt: View, before: Lights) -> Start[Resolved | None]:
-            lights, anew = (before, None) if found is None else lights_again(matt, before, found.rough, settings.seed)
-            return Start(lights, normal_maps(replace(used, views=(matt,)), lights, device)[0], anew)
-
-        refined, start = refine_view(used, start, again, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
-        if start.resolved is not None:
-            shared = shared_variance(used.views[0], start.lights, start.maps, start.resolved, parts.law(), settings.seed, device)
-            confidence = less_confident(refined.material.confidence, at_corners(shared, refined.surface))
-            refined = replace(refined, material=replace(refined.material, confidence=confidence))
-        undone = len(refined.rounds) + 1
-        stage.status(refined.status + (f"; round {undone} fitted much worse and was undone" if undone <= rounds else ""))
+        lights, found = (given, None) if given is not None else first_lights(used, rough, settings.seed)
+        stage.status("given with the capture" if given is not None else words_of(found))
+    refined, part, misfits = refined_from(used, lights, found, given is None, rough, settings, parts, progress)
+    away = 0.0 if found is None else away_deg(refined.lights.direction[0] @ view.camera.rotation.T, lights_under(view, rough))
+    if away > FAR_DEG:
+        with progress.stage("lights") as stage:
+            lights = lights_of_silhouette(view, rough)
+            stage.status(f"rounds turned them {away:.0f} deg from what the silhouette tells: from its normals")
+        refined, part, misfits = refined_from(used, lights, None, True, rough, settings, parts, progress)
     with progress.stage("lights and normals of all views"):
-        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device)
-        pictures = normal_pictures(capture, used, refined)
+        complete = all_lights(capture, part, held, refined.lights, refined.surface, refined.material, device)
+        pictures = normal_pictures(capture, part, refined)
     said = WORDS.format(distance=words)
-    return told(capture, used, asdict(settings), refined, complete, pictures, refined.rounds, progress, [*findings, *misfits], said)
+    return told(capture, part, asdict(settings), refined, complete, pictures, refined.rounds, progress, [*findings, *misfits], said)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from mvps.jackknife import ACROSS, at_corners, shared_variance, without_parts
+from mvps.jackknife import ACROSS, at_corners, disagreement, shared_variance, without_parts
 from mvps.joint.bas_relief import bas_relief, turned
 from mvps.oneview import first_lights
 from mvps.photometric import normal_maps
 from mvps.relief.integrate import integrate
+from mvps.relief.silhouette import inflated_normals
 from mvps.relief.surface import pixel_surface
 from mvps.scene import Camera, Law
 from mvps.synthetic.scene import render_capture
@@ -47,6 +48,12 @@ def test_corners_take_the_mean_of_the_pixels_around() -> None:
     assert np.allclose(at_corners(np.full(9, 0.3), surface), 0.3)
 
 
+def test_what_two_guesses_disagree_by_is_half_eithers() -> None:
+    """Of two pixels one is a tenth of a radian apart: in the mean (0.1^2 / 2) / 2 / 2 along a tangent."""
+    turned = np.array([[np.sin(0.1), 0.0, -np.cos(0.1)], [0.0, 0.0, -1.0]])
+    assert np.allclose(disagreement(turned, np.tile([0.0, 0.0, -1.0], (2, 1))), 0.00125, rtol=1e-2)
+
+
 def shared_part(normal: np.ndarray, true: np.ndarray) -> np.ndarray:
     """(n, 3) what a turn and a bas-relief of all normals (n, 3), camera frame, make of their difference to the true ones: least squares."""
     turns = np.stack([np.cross(axis, normal) for axis in np.eye(3)], 2)
@@ -62,7 +69,8 @@ def test_stated_shared_errors_are_those_that_normals_have() -> None:
     for seed in (0, 1, 3):
         capture, truth = render_capture(SceneSettings(views=1, lights=12, size=72, seed=seed))
         view = capture.views[0]
-        lights, found = first_lights(capture, 0)
+        lights, found = first_lights(capture, inflated_normals(view.mask), 0)
+        assert found is not None
         maps = normal_maps(capture, lights, CPU)[0]
         variance = shared_variance(view, lights, maps, found, LAW, 0, CPU)
         assert variance.shape == (len(view.pixels),) and (variance > 0).all()

@@ -24,9 +24,11 @@ from numpy.typing import NDArray
 from mvps.calibrate import is_metallic
 from mvps.checks.prediction import BRIGHT_QUANTILE
 from mvps.cores import on_cores
+from mvps.correlation import is_glossy
 from mvps.finding import Finding
 from mvps.hull import default_cells, signed_distance, visual_hull
 from mvps.pbr import linear_of_srgb
+from mvps.relief.silhouette import inflated_normals
 from mvps.scene import Capture, Float, View
 from solvers.low_rank import factorise
 
@@ -113,9 +115,11 @@ def linear(view: View, curve: Curve) -> View:
 
 
 def is_metal(capture: Capture) -> bool:
-    """Whether the object is one, by its hull; False for a single view, which has none."""
+    """Whether the object is one, by its hull; of a single view by its inflated silhouette."""
     if len(capture.views) < 2:
-        return False
+        view = capture.views[0]
+        image = np.where(view.shown, view.samples.mean(-1) * view.scale, np.nan)
+        return is_glossy([image], [inflated_normals(view.mask)], np.random.default_rng(0))
     return is_metallic(capture, visual_hull(signed_distance(capture, default_cells(capture))), 0)
 
 

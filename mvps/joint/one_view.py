@@ -82,7 +82,7 @@ def without_lobes(view: View, surface: Surface, material: Material, lights: Ligh
 def refine_view(
     capture: Capture,
     start: Start[T],
-    again: Callable[[View, Lights], Start[T]],
+    again: Callable[[View, Lights, NormalMap], Start[T]],
     law: Law,
     settings: RefineSettings,
     rounds: int,
@@ -93,8 +93,8 @@ def refine_view(
 ) -> tuple[Refined, Start[T]]:
     """Rounds from lights and photometric stereo of the capture's only view, and what the last one that was kept started from.
 
-    again: a start from the view without its lobes, under the lights of the round before. integrated: the surface of normals (pixels, 3),
-    world, with confidence (pixels,). settings: whose rounds are not used, one view has its own kind.
+    again: a start from the view without its lobes, and the lights and normals of the round before. integrated: the surface of normals
+    (pixels, 3), world, with confidence (pixels,). settings: whose rounds are not used, one view has its own kind.
     """
     model = replace(settings.model, sharpness=law.sharpness, grazing=False, bounce=False, gleam=False)
     generator, view = np.random.default_rng(seed), capture.views[0]
@@ -106,7 +106,7 @@ def refine_view(
         if state is not None:
             assert state.vertices is not None
             material = material_of(state, grey_albedo(state.vertices))
-            following = again(without_lobes(view, state.surface, material, state.lights), state.lights)
+            following = again(without_lobes(view, state.surface, material, state.lights), state.lights, state.maps[0])
         lights, maps = following.lights, following.maps
         if settings.free_lights:
             lights, maps = _without_relief(capture, lights, maps, law if state is None else state.law, generator, device)

@@ -142,8 +142,7 @@ def photometric_round(
     state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, senders_of(state, vertices), device, task.half)
     turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
     assert vertices.sigma is not None
-    # Infinite where no sample counts, which may be most; no normal is farther off than this.
-    stated = np.degrees(vertices.sigma.cpu().numpy()[seen]).clip(max=90.0)
+    stated = np.degrees(vertices.sigma.cpu().numpy()[seen]).clip(max=90.0)  # infinite where no sample counts, which may be most
     return {
         "residual": float(relative_residuals(state.views, vertices).nanmedian()),
         "light_change_deg": moved[0],

@@ -14,6 +14,11 @@ outline         normals in the mask's outer band are nearly those of its inflate
 
 The start is the A that maps b' to the inflated silhouette's normals (as calibrate.py does with a hull's).
 What lobes say of the bas-relief comes after (joint/bas_relief.py).
+
+Of metals, enamel and dark gloss the factors say little, and what resolves them then puts lights anywhere. The silhouette's normals n, wrong
+as they are pixel by pixel, say where lights are to some degrees whatever the material: least squares of I_pl / |I_p| = n_p . s_l. So the
+factors are b' under these lights where this leaves less of the photographs, or where the others are not to be believed: where they leave
+more than NO_BODY, or what they came to is FAR_DEG from these lights. The lights are these where neither are.
 """
 
 from __future__ import annotations
@@ -27,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from mvps.camera import pixel_centres
-from mvps.mesh import normalise
+from mvps.mesh import angles_deg, lengths, normalise
 from mvps.scene import Bool, Float, Int, View
 from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, robust_weights, solve_rows
 
@@ -51,6 +56,14 @@ noise of 3 % turned lights by up to 8 deg, docs/findings/one_view.md)."""
 
 ONE_COLOUR = 0.05
 """Difference of log chroma at which two pixels no longer count as of one colour."""
+
+NO_BODY = 0.2
+"""Of the photographs, that factors leave which are not to be believed: half way between what they leave on matte and glossy objects at most
+and where there is no diffuse body (calibrate.py)."""
+
+FAR_DEG = 30.0
+"""Mean angle from the lights under the inflated silhouette's normals from which resolved ones cannot be right: those were 5 to 23 deg off
+on 71 views of all materials, 11 in the median (docs/findings/one_view.md)."""
 
 SWEEPS = 5
 SHADOWED, BRIGHT_QUANTILE = 0.1, 0.8
@@ -112,6 +125,21 @@ def factors(view: View, generator: np.random.Generator) -> Pseudo:
     grey = _Relative(view)
     drawn = generator.permutation(len(grey.image))[:FACTORED]
     return grey.factored(factorise(grey.image[drawn], grey.known[drawn], 3, floor=grey.noise).right)
+
+
+def lights_under(view: View, rough: Float) -> Float:
+    """(lights, 3) intensity times direction, camera frame, by least squares under rough normals (pixels, 3) as they are."""
+    grey = _Relative(view)
+    # All pixels as bright: by their largest samples those that a few lights reach would outweigh all others.
+    level = np.sqrt((grey.known * grey.image**2).sum(1) / np.maximum(grey.known.sum(1), 1))
+    image = grey.image / np.where(level > 0, level, 1.0)[:, None]
+    return solve_rows(image.T, grey.known.T.astype(np.float64), rough)
+
+
+def away_deg(lights: Float, under: Float) -> float:
+    """Mean angle, degrees, between lights (lights, 3) and those under rough normals (lights, 3), of photographs that have samples."""
+    told = lengths(under) > 0
+    return float(angles_deg(normalise(lights[told]), normalise(under[told])).mean()) if told.any() else 0.0
 
 
 def factors_under(view: View, lights: Float) -> Pseudo:
@@ -222,6 +250,19 @@ def resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, generator: 
     for h in np.geomspace(LOOSE, TIGHT, SWEEPS):
         A = _solved(known, A, float(h))
     return A
+
+
+def first_resolved(view: View, pseudo: Pseudo, rough: Float, start: Float, under: Float, generator: np.random.Generator) -> Resolved | None:
+    """The view's first factors with their ambiguity resolved: `pseudo` from start (3, 3), or those under the lights `under` (lights, 3),
+    which the rough normals (pixels, 3) tell; None where nothing but these lights is to be believed."""
+    of_rough = factors_under(view, under)
+    tries = [(pseudo, start)] if pseudo.residual < of_rough.residual else []
+    for factors_, A in [*tries, (of_rough, np.eye(3))]:
+        if factors_.residual < NO_BODY:
+            found = Resolved(factors_, rough, resolved(view, factors_, rough, A, generator))
+            if away_deg(found.lights, under) < FAR_DEG:
+                return found
+    return None
 
 
 def resolved_by(view: View, found: Resolved, generator: np.random.Generator, among: Bool) -> Float:
