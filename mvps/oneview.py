@@ -28,6 +28,7 @@ WORDS = (
     "One view: the surface is what its normals integrate to, open, of what this camera sees; its distance {distance} and heights of steps"
     " are not known from photographs under distant lights."
 )
+UNTOLD = " Its photographs do not tell the lights, which are what the silhouette tells: ten degrees off, or twenty."
 OF_ORIGIN = "is the world origin's"
 FEWEST_LIGHTS = 12
 """From which on trimmed photographs leave enough for normals: nine."""
@@ -69,11 +70,11 @@ def surface_of(view: View, normal: Float, confidence: Float, distance: float) ->
     return pixel_surface(view.camera, view.pixels, local, depth, distance)
 
 
-def first_lights(capture: Capture, rough: Float, seed: int) -> tuple[Lights, Resolved | None]:
+def first_lights(capture: Capture, rough: Float, under: Float, seed: int) -> tuple[Lights, Resolved | None]:
     """Lights of the capture's only view by factorisation, with its ambiguity resolved up to what lobes say later, and what resolved it;
-    those under the rough normals (pixels, 3) of its inflated silhouette where nothing did (None)."""
-    from mvps.calibrate import MINIMUM_LIGHTS, colour_ratios, solve_ambiguity
-    from mvps.relief.ambiguity import factors, first_resolved, lights_under
+    those `under` (lights, 3) the rough normals (pixels, 3) of its inflated silhouette where nothing did (None)."""
+    from mvps.calibrate import MINIMUM_LIGHTS, solve_ambiguity
+    from mvps.relief.ambiguity import factors, first_resolved
 
     view = capture.views[0]
     if len(view.lights) < MINIMUM_LIGHTS:
@@ -82,7 +83,7 @@ def first_lights(capture: Capture, rough: Float, seed: int) -> tuple[Lights, Res
             f" {len(view.lights)}; add photographs, views or --calibrated-lights"
         )
     generator = np.random.default_rng(seed)
-    pseudo, under = factors(view, generator), lights_under(view, rough)
+    pseudo = factors(view, generator)
     try:
         found = first_resolved(view, pseudo, rough, solve_ambiguity(pseudo.left, rough, pseudo.weight), under, generator)
     except np.linalg.LinAlgError as error:
@@ -90,15 +91,7 @@ def first_lights(capture: Capture, rough: Float, seed: int) -> tuple[Lights, Res
             f"{capture.name}: wanted photographs whose lights span three directions, given ones where {error};"
             " use other lights or --calibrated-lights"
         ) from error
-    return lights_of_silhouette(view, rough) if found is None else _lights(view, found.lights, colour_ratios(view)), found
-
-
-def lights_of_silhouette(view: View, rough: Float) -> Lights:
-    """The view's lights under the rough normals (pixels, 3) of its inflated silhouette."""
-    from mvps.calibrate import colour_ratios
-    from mvps.relief.ambiguity import lights_under
-
-    return _lights(view, lights_under(view, rough), colour_ratios(view))
+    return _lights(view, under if found is None else found.lights), found
 
 
 def words_of(found: Resolved | None) -> str:
@@ -124,11 +117,12 @@ def lights_again(view: View, lights: Lights, rough: Float, seed: int) -> tuple[L
     return _lights(view, found.lights, lights.intensity[0] / strength), found
 
 
-def _lights(view: View, scaled: Float, colour: Float) -> Lights:
-    """Lights of intensity times direction (lights, 3), camera frame; colour (lights, 3) of their intensities, mean one."""
-    from mvps.calibrate import normalised, without_gaps
+def _lights(view: View, scaled: Float, colour: Float | None = None) -> Lights:
+    """Lights of intensity times direction (lights, 3), camera frame; colour (lights, 3) of their intensities, mean one, that of the view as
+    a whole if None."""
+    from mvps.calibrate import colour_ratios, normalised, without_gaps
 
-    scaled = without_gaps(scaled)
+    scaled, colour = without_gaps(scaled), colour_ratios(view) if colour is None else colour
     strength = np.linalg.norm(scaled, axis=1, keepdims=True)
     return normalised([scaled / strength @ view.camera.rotation], [strength * colour], True)
 
@@ -244,19 +238,20 @@ def reconstruct_view(
     from mvps.relief.silhouette import inflated_normals
 
     device, view = chosen_device(settings.device), used.views[0]
-    words, rough = distance_of(view)[1], inflated_normals(view.mask)
+    rough = inflated_normals(view.mask)
+    under = lights_under(view, rough)
     with progress.stage("lights") as stage:
-        lights, found = (given, None) if given is not None else first_lights(used, rough, settings.seed)
+        lights, found = (given, None) if given is not None else first_lights(used, rough, under, settings.seed)
         stage.status("given with the capture" if given is not None else words_of(found))
     refined, part, misfits = refined_from(used, lights, found, given is None, rough, settings, parts, progress)
-    away = 0.0 if found is None else away_deg(refined.lights.direction[0] @ view.camera.rotation.T, lights_under(view, rough))
+    away = 0.0 if found is None else away_deg(refined.lights.direction[0] @ view.camera.rotation.T, under)
     if away > FAR_DEG:
         with progress.stage("lights") as stage:
-            lights = lights_of_silhouette(view, rough)
+            lights, found = _lights(view, under), None
             stage.status(f"rounds turned them {away:.0f} deg from what the silhouette tells: from its normals")
-        refined, part, misfits = refined_from(used, lights, None, True, rough, settings, parts, progress)
+        refined, part, misfits = refined_from(used, lights, found, True, rough, settings, parts, progress)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, part, held, refined.lights, refined.surface, refined.material, device)
         pictures = normal_pictures(capture, part, refined)
-    said = WORDS.format(distance=words)
+    said = WORDS.format(distance=distance_of(view)[1]) + (UNTOLD if given is None and found is None else "")
     return told(capture, part, asdict(settings), refined, complete, pictures, refined.rounds, progress, [*findings, *misfits], said)

@@ -10,6 +10,7 @@ from mvps.jackknife import ACROSS, at_corners, disagreement, shared_variance, wi
 from mvps.joint.bas_relief import bas_relief, turned
 from mvps.oneview import first_lights
 from mvps.photometric import normal_maps
+from mvps.relief.ambiguity import lights_under
 from mvps.relief.integrate import integrate
 from mvps.relief.silhouette import inflated_normals
 from mvps.relief.surface import pixel_surface
@@ -69,7 +70,8 @@ def test_stated_shared_errors_are_those_that_normals_have() -> None:
     for seed in (0, 1, 3):
         capture, truth = render_capture(SceneSettings(views=1, lights=12, size=72, seed=seed))
         view = capture.views[0]
-        lights, found = first_lights(capture, inflated_normals(view.mask), 0)
+        rough = inflated_normals(view.mask)
+        lights, found = first_lights(capture, rough, lights_under(view, rough), 0)
         assert found is not None
         maps = normal_maps(capture, lights, CPU)[0]
         variance = shared_variance(view, lights, maps, found, LAW, 0, CPU)

@@ -16,12 +16,13 @@ from mvps.joint.bas_relief import bas_relief, turned
 from mvps.joint.one_view import Start, refine_view, with_rim, without_lobes
 from mvps.joint.refine import RefineSettings
 from mvps.load import read_capture, read_truth
-from mvps.mesh import angles_deg
+from mvps.mesh import angles_deg, normalise
 from mvps.oneview import distance_of, first_lights, lights_again, surface_of, without_misfits
 from mvps.photometric import normal_maps
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
 from mvps.reconstruct import main as reconstruct_main
+from mvps.relief.ambiguity import lights_under
 from mvps.relief.silhouette import inflated_normals
 from mvps.rendering import photograph
 from mvps.scene import Capture, CaptureError, Law, Lights, Material, NormalMap, Surface, Truth, View, less_confident
@@ -148,7 +149,7 @@ def test_without_lobes_lights_are_found_that_highlights_turn() -> None:
     assert without < 0.2 * with_lobes
 
     rough = inflated_normals(view.mask)
-    first = first_lights(glossy, rough, 0)[0]
+    first = first_lights(glossy, rough, lights_under(view, rough), 0)[0]
     again = lights_again(body, first, rough, 0)[0]
     before, after = (angles_deg(found.direction[0], true).mean() for found in (first, again))
     assert before > 5 and after < 0.5 * before
@@ -159,7 +160,8 @@ def test_where_photographs_do_not_tell_lights_the_silhouette_does(captures: Path
     """Of metal what resolves the factors puts lights 41 and 50 deg off."""
     capture = read_capture(captures / name, [view])
     of = capture.views[0]
-    lights, found = first_lights(capture, inflated_normals(of.mask), 0)
+    rough = inflated_normals(of.mask)
+    lights, found = first_lights(capture, rough, lights_under(of, rough), 0)
     assert (found is not None) is told
     true = read_truth(captures / name).direction[of.name]
     assert angles_deg(lights.direction[0], true).mean() < (7 if told else 15)
@@ -171,7 +173,19 @@ def test_one_view_of_metal_keeps_the_lights_that_its_silhouette_tells(captures: 
     errors = evaluate_result(tmp_path / "result", captures / "buddha")
     assert errors["light_error_deg"] < 20 and errors["map_normal_error_deg"] < 40
     metrics = (tmp_path / "result" / "metrics.json").read_text()
-    assert "from the silhouette's normals" in metrics and "poor fit" in metrics
+    assert "do not tell the lights" in metrics and "poor fit" in metrics
+
+
+def test_lights_that_rounds_turn_far_away_are_the_silhouettes(made: tuple[Capture, Truth], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near at first, far at the end: done again from what the silhouette tells, which stays, and the status says so."""
+    away = iter([0.0, 44.0])
+    monkeypatch.setattr("mvps.relief.ambiguity.away_deg", lambda *_: next(away))
+    capture = made[0]
+    view = capture.views[0]
+    found = reconstruct(capture, Settings("made", preset="draft"), None, Progress())
+    under = normalise(lights_under(view, inflated_normals(view.mask))) @ view.camera.rotation
+    assert angles_deg(found.lights.direction[0], under).max() < 0.01
+    assert "do not tell the lights" in found.metrics["status"]["text"]
 
 
 @pytest.mark.parametrize(("name", "normals"), [("ball", 2.5), ("bear", 5.5)])
