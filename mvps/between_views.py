@@ -34,6 +34,11 @@ CLEARLY_NEARER = 0.9
 """Part of how far views are apart under first lights, up to which others are believed in their place: of 0.95 to 1.05 either may be nearer
 to the truth, by a degree or two (docs/findings/lights.md). Of one view's lights it is that view's part of it."""
 
+BODY = 0.1
+"""Of the photographs, that factors leave up to which they are believed until others are CLEARLY_NEARER. Where they leave more, much is not
+diffuse, or in shadow, and nothing speaks for either but what views say: the nearer are believed. Matte objects leave 0.02 to 0.05, metals
+0.13 and more; of glossy ones between them either rule chooses as well (docs/findings/lights.md)."""
+
 ROUNDS = 3
 
 
@@ -81,9 +86,17 @@ def _lengths(vectors: Float) -> Float:
     return length
 
 
-def nearer(of: Sequence[VertexSamples], first: Sequence[Float], other: Sequence[Float], one_rig: bool) -> list[bool]:
-    """Of which views what is said under the other lights is believed, in place of the first: where views are clearly nearer to each other.
-    Of a rig all or none; else one view after the other changes, from none and from all of them on."""
+def nearest(of: Sequence[VertexSamples], candidates: Sequence[Sequence[Float]], one_rig: bool) -> int:
+    """Under which of several lights views are nearest to each other, by what is said (n, 3) under each; the last where nothing tells."""
+    distance = [apart(of, by_view, one_rig) for by_view in candidates]
+    return max(i for i, d in enumerate(distance) if d == min(distance))
+
+
+def nearer(
+    of: Sequence[VertexSamples], first: Sequence[Float], other: Sequence[Float], one_rig: bool, clearly: float = CLEARLY_NEARER
+) -> list[bool]:
+    """Of which views what is said under the other lights is believed, in place of the first: where views are nearer to each other, at most
+    `clearly` times as far apart. Of a rig all or none; else one view after the other changes, from none and from all of them on."""
     count = len(of)
 
     def distance(chosen: Sequence[bool]) -> float:
@@ -91,7 +104,7 @@ def nearer(of: Sequence[VertexSamples], first: Sequence[Float], other: Sequence[
 
     none, every = [False] * count, [True] * count
     if one_rig:
-        return every if distance(every) < CLEARLY_NEARER * distance(none) else none
+        return every if distance(every) < clearly * distance(none) else none
     found, least = none, np.inf
     for chosen in (none, every):
         now, before = distance(chosen), np.inf
@@ -102,8 +115,8 @@ def nearer(of: Sequence[VertexSamples], first: Sequence[Float], other: Sequence[
             for i in range(count):
                 changed = [is_other ^ (k == i) for k, is_other in enumerate(chosen)]
                 then = distance(changed)
-                if then < now * (1 - (1 - CLEARLY_NEARER) / count):
+                if then < now * (1 - (1 - clearly) / count):
                     chosen, now = changed, then
-        if now < CLEARLY_NEARER * least:
+        if now < clearly * least:
             found, least = chosen, now
     return found

@@ -19,7 +19,9 @@ solved in turn in
     I_pl = a_p (n_p . s_l)+     for the rough shape's normals as they are.
 
 So they are where views then say more alike of the same places (between_views.py): the hull of few views has wrong normals all over, which
-fix A wrongly, and factors of samples of which many are in shadow may be no factors of the images.
+fix A wrongly, and factors of samples of which many are in shadow, or highlights, may be no factors of the images. Where factors leave much,
+Lambert's law explains little whatever the albedo is, and wrong normals draw lights away with every sweep: there what views say tells how
+many there are, none among them, which is plain least squares with one albedo.
 
 Factors know no frame. Whether a rig stands still with the camera or in the world, while the camera moves, is told by which of the two
 leaves less under the rough shape's normals and one albedo at every vertex (sharing.py). Nor do factors find lights that most pixels of a
@@ -36,32 +38,22 @@ for the rough shape's normals, one albedo for the whole object (other albedos ar
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mvps.between_views import nearer, said
+from mvps.between_views import BODY, CLEARLY_NEARER, nearer, nearest, said
 from mvps.cores import on_cores
 from mvps.correlation import alike_in_all_views, glossy_lights, is_glossy, lamps_of_a_glossy_surface
 from mvps.mesh import normalise, vertex_normals
-from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface, View
-from mvps.sharing import Frame, shared_frame, vertex_samples
-from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
+from mvps.pixel_samples import BRIGHT_QUANTILE, PIXELS_PER_VIEW, SHADOWED, PixelSamples, in_frame, pixel_samples, pooled
+from mvps.scene import Capture, CaptureError, Float, Lights, Surface, View
+from mvps.sharing import shared_frame, vertex_samples
+from mvps.visibility import RayCaster, ray_caster
 from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
 
 MINIMUM_LIGHTS = 4
 """A rank-3 factorisation of three or fewer columns is exact for any data and so says nothing."""
-
-PIXELS_PER_VIEW = 1000
-"""Pixels drawn from a view: three unknowns a light against thousands of equations leave the error to the model, not to sampling."""
-
-SHADOWED = 0.1
-"""Samples below this part of a pixel's bright level are treated as shadowed: Lambert's law gives cos(84 deg) there, and penumbrae and
-inter-reflections are as large."""
-
-BRIGHT_QUANTILE = 0.8
-"""A pixel's bright level: above its shadows, below its highlights."""
 
 POOLED_VARIANCE_RATIO = 2.0
 """One rig is believed while pooling the views adds less variance than single views leave."""
@@ -72,8 +64,11 @@ down to the error of Lambertian normals on glossy objects. Between them the pixe
 
 AMBIGUITY_SWEEPS = 20
 
+ALTERNATIONS = (0, 1, 2, 5, 10, 20)
+"""Sweeps of albedo and lights in turn after which views are asked of them."""
+
 PIXELS_FOR_THE_OTHER = 4000
-"""Of all views, from which a rig under the rough shape's normals is found, to be held against that of the factors."""
+"""Of all views, from which a rig under the rough shape's normals is found that is held against that of the factors."""
 
 
 @dataclass(frozen=True)
@@ -103,70 +98,6 @@ class Calibration:
         kind += ", which do not tell them one by one" if self.assumed else ""
         kind += ", from the rough shape's normals where factors are not believed" if self.under_normals else ""
         return f"{kind}; three factors leave {100 * self.residual:.1f} % of the images"
-
-
-@dataclass(frozen=True)
-class _Sampled:
-    """Grey images of some pixels of one view: image (n, lights) over its bright level (n,); known (n, lights), neither clipped nor in
-    shadow; normal (n, 3) in the camera's frame; shown (n, lights), False where the photograph was left out."""
-
-    image: NDArray[np.float64]
-    bright: Float
-    known: Bool
-    normal: Float
-    noise: float
-    shown: Bool
-
-    @property
-    def absolute(self) -> Float:
-        """(n, lights) radiance."""
-        absolute: Float = self.image * self.bright[:, None]
-        return absolute
-
-    def part(self, most: int) -> _Sampled:
-        """The first pixels of them."""
-        few = slice(most)
-        return replace(
-            self, image=self.image[few], bright=self.bright[few], known=self.known[few], normal=self.normal[few], shown=self.shown[few]
-        )
-
-    @property
-    def highlights(self) -> Float:
-        """(n, lights) radiance, clipped or not, NaN where the photograph was left out."""
-        return np.where(self.shown, self.absolute, np.nan)
-
-
-def _sampled(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> _Sampled:
-    chosen = generator.permutation(len(view.pixels))[:PIXELS_PER_VIEW]
-    hits = camera_hits(caster, view.camera, view.pixels[chosen])
-    on = hits.face >= 0
-    if not on.any():
-        raise CaptureError(
-            f"{view.name}: wanted a camera that sees what all masks enclose, given one from which no pixel of its mask meets it;"
-            " check this view's rotation, translation and mask, or leave it out with --views"
-        )
-    chosen, hits = chosen[on], Hits(hits.face[on], hits.barycentric[on], hits.distance[on])
-    image = view.samples[chosen].astype(np.float64).mean(-1) * view.scale
-    bright = np.quantile(image if view.shown.all() else image[:, view.shown], BRIGHT_QUANTILE, axis=1, keepdims=True)
-    bright = np.maximum(bright, view.scale)
-    known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
-    seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
-    shown = np.broadcast_to(view.shown, image.shape)
-    return _Sampled(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)), shown)
-
-
-def _pooled(samples: list[_Sampled]) -> _Sampled:
-    """The pixels of all views as if they were one's."""
-    names = ("image", "bright", "known", "normal", "shown")
-    image, bright, known, normal, shown = (np.concatenate([getattr(s, name) for s in samples]) for name in names)
-    return _Sampled(image, bright, known, normal, float(np.median([s.noise for s in samples])), shown)
-
-
-def _in_frame(samples: list[_Sampled], capture: Capture, frame: Frame) -> list[_Sampled]:
-    """The samples with normals in this frame."""
-    if frame == "camera":
-        return samples
-    return [replace(s, normal=s.normal @ view.camera.rotation) for s, view in zip(samples, capture.views, strict=True)]
 
 
 def _gram(pseudo: Float, normal: Float, weight: Float) -> Float:
@@ -231,7 +162,7 @@ def _fixed(A: Float, pseudo: Float, normal: Float, weight: Float) -> bool:
     return bool(np.linalg.eigvalsh(_gram(unit, normal, inliers))[1] > FINE_NORMAL**2 * inliers.sum())
 
 
-def _ambiguity(factors: Factorisation, samples: list[_Sampled]) -> Float | None:
+def _ambiguity(factors: Factorisation, samples: list[PixelSamples]) -> Float | None:
     """(3, 3) A by the normals of the rough shape, None where they do not fix it."""
     normal, weight = np.concatenate([s.normal for s in samples]), factors.weight.mean(1).astype(np.float64)
     try:
@@ -241,27 +172,30 @@ def _ambiguity(factors: Factorisation, samples: list[_Sampled]) -> Float | None:
     return A if _fixed(A, factors.left, normal, weight) else None
 
 
-def _mostly_fixed(separate: list[Factorisation], samples: list[_Sampled]) -> bool:
+def _mostly_fixed(separate: list[Factorisation], samples: list[PixelSamples]) -> bool:
     """Whether most views' own normals fix A."""
     return 2 * sum(A is not None for A in on_cores(lambda f, s: _ambiguity(f, [s]), separate, samples)) > len(samples)
 
 
-def _scaled_lights(factors: Factorisation | None, samples: list[_Sampled]) -> tuple[Float, bool]:
-    """(lights, 3) intensity times direction in the frame of the samples' normals, and whether these did not fix the ambiguity, or there
-    are no factors."""
-    A = None if factors is None else _ambiguity(factors, samples)
-    if factors is None or A is None:
-        albedo, lights = _under_normals(samples)
-    else:
-        albedo, lights = np.linalg.norm(factors.left @ A.T, axis=1), factors.right @ np.linalg.inv(A)
-    # The median albedo is the unit, so that lights of separately solved views share one scale.
+def _by_factors(factors: Factorisation, samples: list[PixelSamples]) -> Float | None:
+    """(lights, 3) intensity times direction in the frame of the samples' normals, None where these do not fix the ambiguity."""
+    A = _ambiguity(factors, samples)
+    if A is None:
+        return None
+    return _of_median_albedo(factors.right @ np.linalg.inv(A), np.linalg.norm(factors.left @ A.T, axis=1), samples)
+
+
+def _of_median_albedo(lights: Float, albedo: Float, samples: list[PixelSamples]) -> Float:
+    """Lights (lights, 3) for albedo (n,) over bright levels, scaled so that those of separately solved views share one scale: the median
+    albedo is the unit."""
     scaled: Float = lights * np.median(albedo * np.concatenate([s.bright for s in samples]))
-    return without_gaps(scaled), A is None
+    return without_gaps(scaled)
 
 
-def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
-    """Albedo (n,) over the pixels' bright levels and lights (lights, 3) in turn, for the rough shape's normals as they are."""
-    of = _pooled(samples)
+def _under_normals(samples: list[PixelSamples]) -> list[Float]:
+    """(lights, 3) intensity times direction in the frame of the samples' normals, for these as they are: albedo and lights in turn, after
+    each number of sweeps of ALTERNATIONS."""
+    of = pooled(samples)
     # Where fewer lights than the brightest fifth reach a pixel its bright level is none, and what does would outweigh all else.
     level = np.sqrt((of.known * of.image**2).sum(1) / np.maximum(of.known.sum(1), 1))
     level = np.where(level > 0, level, 1.0)
@@ -272,14 +206,17 @@ def _under_normals(samples: list[_Sampled]) -> tuple[Float, Float]:
             " --calibrated-lights"
         )
     lights, albedo = solve_rows(image.T, known.T.astype(np.float64), normal), np.ones(len(image))
-    for _ in range(AMBIGUITY_SWEEPS):
+    found = [_of_median_albedo(lights, level, samples)]
+    for sweep in range(1, ALTERNATIONS[-1] + 1):
         shading = np.maximum(normal @ lights.T, 0)
         lit = known & (shading > 0)
         weight = robust_weights(image - albedo[:, None] * shading, lit, noise)
         albedo = (weight * image * shading).sum(1) / np.maximum((weight * shading**2).sum(1), np.finfo(float).tiny)
         weight = robust_weights((image - albedo[:, None] * shading).T, lit.T, noise)
         lights = solve_rows(image.T, weight, albedo[:, None] * normal)
-    return albedo * level, lights
+        if sweep in ALTERNATIONS:
+            found.append(_of_median_albedo(lights, albedo * level, samples))
+    return found
 
 
 def without_gaps(scaled: Float) -> Float:
@@ -291,7 +228,7 @@ def without_gaps(scaled: Float) -> Float:
     return np.where(known[:, None], scaled, np.array([0.0, 0.0, -1.0]) * usual)
 
 
-def _from_normals(sample: _Sampled) -> Float:
+def _from_normals(sample: PixelSamples) -> Float:
     """(lights, 3) least-squares lights for the rough shape's normals and one albedo: the case of few lights."""
     # A pixel's own bright level says nothing of its albedo where few lights made it: radiance itself is used.
     absolute = sample.absolute
@@ -329,13 +266,13 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
     tried."""
     generator = np.random.default_rng(seed)
     caster, normal = ray_caster(surface), vertex_normals(surface)
-    samples = [_sampled(view, caster, normal, generator) for view in capture.views]
+    samples = [pixel_samples(view, caster, normal, generator) for view in capture.views]
     counts = {len(view.lights) for view in capture.views}
     may_share &= len(capture.views) > 1 and len({view.lights for view in capture.views}) == 1
     if min(counts) < MINIMUM_LIGHTS:
         frame = shared_frame(capture, caster, np.random.default_rng(seed)) if may_share else None
         if frame is not None:
-            rig = _from_normals(_pooled(_in_frame(samples, capture, frame)))
+            rig = _from_normals(pooled(in_frame(samples, capture, frame)))
             lights = _assemble(capture, [rig] * len(samples), True, frame == "world")
         else:
             lights = _assemble(capture, [_from_normals(sample) for sample in samples], False)
@@ -353,28 +290,25 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
             return Calibration(_assemble(capture, [lamps] * len(samples), True, fixed=True), residual, fourth, True)
         scaled = [glossy_lights(s.highlights, s.normal) for s in samples]
         return Calibration(_assemble(capture, scaled, False), residual, fourth, True)
-    each = [_scaled_lights(f, [s]) for f, s in zip(separate, samples, strict=True)]
-    first, left_open = [scaled for scaled, _ in each], any(is_open for _, is_open in each)
-    others = _nearer(capture, caster, samples, first, False, np.random.default_rng(seed))
-    left_open |= any(other is not None for other in others)
-    first = [scaled if other is None else other for scaled, other in zip(first, others, strict=True)]
-    return Calibration(_assemble(capture, first, False), residual, fourth, under_normals=left_open)
+    by_factors = [_by_factors(f, [s]) for f, s in zip(separate, samples, strict=True)]
+    scaled, under_normals = _believed(capture, caster, samples, by_factors, residual, False, seed)
+    return Calibration(_assemble(capture, scaled, False), residual, fourth, under_normals=under_normals)
 
 
 def _one_rig(
     capture: Capture,
     caster: RayCaster,
-    samples: list[_Sampled],
+    samples: list[PixelSamples],
     separate: list[Factorisation],
     residual: float,
     generator: np.random.Generator,
     seed: int,
 ) -> Calibration | None:
     """Lights that all views share, None where they share none; residual: what separate factors leave."""
-    pooled = _pooled(samples)
-    together = factorise(pooled.image, pooled.known, 3, floor=pooled.noise)
+    of_all = pooled(samples)
+    together = factorise(of_all.image, of_all.known, 3, floor=of_all.noise)
     left, fourth = together.residual, float(together.singular_values[3])
-    metallic = is_glossy([pooled.highlights], [pooled.normal], generator)
+    metallic = is_glossy([of_all.highlights], [of_all.normal], generator)
     told = alike_in_all_views([s.highlights for s in samples], [s.normal for s in samples], metallic)
     alike = told is not False and together.residual**2 < POOLED_VARIANCE_RATIO * residual**2
     lamps = _glossy_lamps(capture, samples) if metallic else None
@@ -386,39 +320,58 @@ def _one_rig(
     if not (alike or frame or flat):
         return None
     if metallic:
-        rig, left_open = glossy_lights(pooled.highlights, pooled.normal), False
-    else:
-        factors = None if frame == "world" or not (alike or flat) else together
-        rig, left_open = _scaled_lights(factors, _in_frame(samples, capture, frame or "camera"))
-        if factors is not None and not left_open:
-            few = max(PIXELS_FOR_THE_OTHER // len(samples), 1)
-            some = [s.part(few) for s in samples]
-            other = _nearer(capture, caster, some, [rig] * len(some), True, np.random.default_rng(seed))[0]
-            rig, left_open = (rig if other is None else other), other is not None
-    lights = _assemble(capture, [rig] * len(samples), True, frame == "world")
-    return Calibration(lights, left, fourth, metallic, flat, left_open)
+        rig = glossy_lights(of_all.highlights, of_all.normal)
+        return Calibration(_assemble(capture, [rig] * len(samples), True), left, fourth, True, flat)
+    if frame == "world":
+        rig = _under_normals(in_frame(samples, capture, frame))[-1]
+        return Calibration(_assemble(capture, [rig] * len(samples), True, True), left, fourth, False, flat, True)
+    by_factors = _by_factors(together, samples) if alike or flat else None
+    scaled, under_normals = _believed(capture, caster, samples, [by_factors] * len(samples), left, True, seed)
+    return Calibration(_assemble(capture, scaled, True), left, fourth, False, flat, under_normals)
 
 
-def _nearer(
-    capture: Capture, caster: RayCaster, samples: list[_Sampled], first: list[Float], one_rig: bool, generator: np.random.Generator
-) -> list[Float | None]:
-    """Per view the lights (lights, 3) under the rough shape's normals, where views are clearly nearer to each other under them than under
-    the first ones (lights, 3), None where not. Of one rig the views' first lights are the same, and so are these."""
+def _believed(
+    capture: Capture,
+    caster: RayCaster,
+    samples: list[PixelSamples],
+    by_factors: list[Float | None],
+    left: float,
+    one_rig: bool,
+    seed: int,
+) -> tuple[list[Float], bool]:
+    """Per view the lights (lights, 3) by factors, None where these do not fix the ambiguity, or under the rough shape's normals, by what
+    views say of the same places; and whether any are the latter. left: what factors leave of the photographs."""
     try:
-        other = [_scaled_lights(None, samples)[0]] * len(samples) if one_rig else on_cores(lambda s: _scaled_lights(None, [s])[0], samples)
+        by_sweeps = _by_sweeps(samples, one_rig, by_factors[0] is not None)
     except CaptureError:
         # Normals in a plane say nothing of lights across it.
-        return [None] * len(samples)
-    of = vertex_samples(capture, caster, generator)
+        fixed = [lights for lights in by_factors if lights is not None]
+        if len(fixed) < len(samples):
+            raise
+        return fixed, False
+    of = vertex_samples(capture, caster, np.random.default_rng(seed))
 
     def said_under(lights: list[Float]) -> list[Float]:
         return on_cores(lambda part, s, view: said(part, s, view.camera, view.scale), of, lights, capture.views)
 
-    chosen = nearer(of, said_under(first), said_under(other), one_rig)
-    return [lights if is_other else None for lights, is_other in zip(other, chosen, strict=True)]
+    lambertian = left < BODY
+    asked = by_sweeps[-1:] if lambertian else by_sweeps
+    other = asked[nearest(of, [said_under(lights) for lights in asked], one_rig)]
+    first = [o if lights is None else lights for lights, o in zip(by_factors, other, strict=True)]
+    chosen = nearer(of, said_under(first), said_under(other), one_rig, CLEARLY_NEARER if lambertian else 1.0)
+    scaled = [o if is_other else lights for lights, o, is_other in zip(first, other, chosen, strict=True)]
+    return scaled, any(chosen) or any(lights is None for lights in by_factors)
 
 
-def _glossy_lamps(capture: Capture, samples: list[_Sampled]) -> Float | None:
+def _by_sweeps(samples: list[PixelSamples], one_rig: bool, few: bool) -> list[list[Float]]:
+    """Every view's lights (lights, 3) under the rough shape's normals, after each number of sweeps; few: a rig's by some of the pixels."""
+    if one_rig:
+        most = max(PIXELS_FOR_THE_OTHER // len(samples), 1) if few else PIXELS_PER_VIEW
+        return [[rig] * len(samples) for rig in _under_normals([s.part(most) for s in samples])]
+    return [list(of_sweep) for of_sweep in zip(*on_cores(lambda s: _under_normals([s]), samples), strict=True)]
+
+
+def _glossy_lamps(capture: Capture, samples: list[PixelSamples]) -> Float | None:
     """Lights of a glossy surface that stand still in the world, where they do (correlation.py)."""
     rotations = [view.camera.rotation for view in capture.views]
     return lamps_of_a_glossy_surface([s.highlights for s in samples], [s.normal for s in samples], rotations)
@@ -428,7 +381,7 @@ def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
     """Whether highlights explain the photographs better than Lambert's law does, every view for itself, under a rough surface's normals."""
     generator = np.random.default_rng(seed)
     caster, normal = ray_caster(surface), vertex_normals(surface)
-    samples = [_sampled(view, caster, normal, generator) for view in capture.views]
+    samples = [pixel_samples(view, caster, normal, generator) for view in capture.views]
     return is_glossy([s.highlights for s in samples], [s.normal for s in samples], generator)
 
 

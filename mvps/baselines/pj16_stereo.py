@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.baselines.pj16_domain import Domain, Warped
-from mvps.calibrate import BRIGHT_QUANTILE, SHADOWED, normalised
+from mvps.calibrate import normalised
 from mvps.camera import rig_frame
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise
+from mvps.pixel_samples import BRIGHT_QUANTILE, SHADOWED
 from mvps.scene import RELIABLE, Bool, Float, Int, Lights
 from solvers.low_rank import robust_weights, solve_rows
 

@@ -1,0 +1,95 @@
+"""Grey samples of pixels, with the normals that a rough surface has there.
+
+Lambert's law holds of what is neither clipped, nor in shadow, nor a highlight. What is in shadow is told by each pixel's own bright level,
+which a fifth of its samples exceed. Over that level pixels are looked at, so that dark ones count as bright ones do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvps.mesh import normalise
+from mvps.scene import Bool, Capture, CaptureError, Float, View
+from mvps.sharing import Frame
+from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
+
+PIXELS_PER_VIEW = 1000
+"""Pixels drawn from a view: three unknowns a light against thousands of equations leave the error to the model, not to sampling."""
+
+SHADOWED = 0.1
+"""Samples below this part of a pixel's bright level are treated as shadowed: Lambert's law gives cos(84 deg) there, and penumbrae and
+inter-reflections are as large."""
+
+BRIGHT_QUANTILE = 0.8
+"""A pixel's bright level: above its shadows, below its highlights."""
+
+
+@dataclass(frozen=True)
+class PixelSamples:
+    """Grey images of some pixels of one view: image (n, lights) over its bright level (n,); known (n, lights), neither clipped nor in
+    shadow; normal (n, 3) in the camera's frame; shown (n, lights), False where the photograph was left out."""
+
+    image: NDArray[np.float64]
+    bright: Float
+    known: Bool
+    normal: Float
+    noise: float
+    shown: Bool
+
+    @property
+    def absolute(self) -> Float:
+        """(n, lights) radiance."""
+        absolute: Float = self.image * self.bright[:, None]
+        return absolute
+
+    def part(self, most: int) -> PixelSamples:
+        """The first pixels of them."""
+        few = slice(most)
+        return replace(
+            self, image=self.image[few], bright=self.bright[few], known=self.known[few], normal=self.normal[few], shown=self.shown[few]
+        )
+
+    @property
+    def highlights(self) -> Float:
+        """(n, lights) radiance, clipped or not, NaN where the photograph was left out."""
+        return np.where(self.shown, self.absolute, np.nan)
+
+
+def pixel_samples(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> PixelSamples:
+    """Of pixels of a view drawn among those that meet the surface of `caster`, whose vertices have these normals (V, 3), world frame.
+
+    Raises CaptureError where none meets it.
+    """
+    chosen = generator.permutation(len(view.pixels))[:PIXELS_PER_VIEW]
+    hits = camera_hits(caster, view.camera, view.pixels[chosen])
+    on = hits.face >= 0
+    if not on.any():
+        raise CaptureError(
+            f"{view.name}: wanted a camera that sees what all masks enclose, given one from which no pixel of its mask meets it;"
+            " check this view's rotation, translation and mask, or leave it out with --views"
+        )
+    chosen, hits = chosen[on], Hits(hits.face[on], hits.barycentric[on], hits.distance[on])
+    image = view.samples[chosen].astype(np.float64).mean(-1) * view.scale
+    bright = np.quantile(image if view.shown.all() else image[:, view.shown], BRIGHT_QUANTILE, axis=1, keepdims=True)
+    bright = np.maximum(bright, view.scale)
+    known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
+    seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
+    shown = np.broadcast_to(view.shown, image.shape)
+    return PixelSamples(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)), shown)
+
+
+def pooled(samples: list[PixelSamples]) -> PixelSamples:
+    """The pixels of all views as if they were one's, each with the normal in its own view's frame."""
+    names = ("image", "bright", "known", "normal", "shown")
+    image, bright, known, normal, shown = (np.concatenate([getattr(s, name) for s in samples]) for name in names)
+    return PixelSamples(image, bright, known, normal, float(np.median([s.noise for s in samples])), shown)
+
+
+def in_frame(samples: list[PixelSamples], capture: Capture, frame: Frame) -> list[PixelSamples]:
+    """The samples with normals in this frame."""
+    if frame == "camera":
+        return samples
+    return [replace(s, normal=s.normal @ view.camera.rotation) for s, view in zip(samples, capture.views, strict=True)]
