@@ -37,7 +37,7 @@ to the truth, by a degree or two (docs/findings/lights.md). Of one view's lights
 BODY = 0.1
 """Of the photographs, that factors leave up to which they are believed until others are CLEARLY_NEARER. Where they leave more, much is not
 diffuse, or in shadow, and nothing speaks for either but what views say: the nearer are believed. Matte objects leave 0.02 to 0.05, metals
-0.13 and more; of glossy ones between them either rule chooses as well (docs/findings/lights.md)."""
+0.13 and more, noise of some percent as much; of glossy ones between them either rule chooses as well (docs/findings/lights.md)."""
 
 ROUNDS = 3
 

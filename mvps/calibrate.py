@@ -321,13 +321,13 @@ def _one_rig(
         return None
     if metallic:
         rig = glossy_lights(of_all.highlights, of_all.normal)
-        return Calibration(_assemble(capture, [rig] * len(samples), True), left, fourth, True, flat)
+        return Calibration(_assemble(capture, [rig] * len(samples), True), left, fourth, metallic, assumed=flat)
     if frame == "world":
         rig = _under_normals(in_frame(samples, capture, frame))[-1]
-        return Calibration(_assemble(capture, [rig] * len(samples), True, True), left, fourth, False, flat, True)
+        return Calibration(_assemble(capture, [rig] * len(samples), True, fixed=True), left, fourth, under_normals=True)
     by_factors = _by_factors(together, samples) if alike or flat else None
     scaled, under_normals = _believed(capture, caster, samples, [by_factors] * len(samples), left, True, seed)
-    return Calibration(_assemble(capture, scaled, True), left, fourth, False, flat, under_normals)
+    return Calibration(_assemble(capture, scaled, True), left, fourth, assumed=flat, under_normals=under_normals)
 
 
 def _believed(
@@ -356,9 +356,11 @@ def _believed(
 
     lambertian = left < BODY
     asked = by_sweeps[-1:] if lambertian else by_sweeps
-    other = asked[nearest(of, [said_under(lights) for lights in asked], one_rig)]
+    under = [said_under(lights) for lights in asked]
+    best = nearest(of, under, one_rig)
+    other = asked[best]
     first = [o if lights is None else lights for lights, o in zip(by_factors, other, strict=True)]
-    chosen = nearer(of, said_under(first), said_under(other), one_rig, CLEARLY_NEARER if lambertian else 1.0)
+    chosen = nearer(of, said_under(first), under[best], one_rig, CLEARLY_NEARER if lambertian else 1.0)
     scaled = [o if is_other else lights for lights, o, is_other in zip(first, other, chosen, strict=True)]
     return scaled, any(chosen) or any(lights is None for lights in by_factors)
 

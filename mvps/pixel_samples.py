@@ -30,7 +30,8 @@ BRIGHT_QUANTILE = 0.8
 @dataclass(frozen=True)
 class PixelSamples:
     """Grey images of some pixels of one view: image (n, lights) over its bright level (n,); known (n, lights), neither clipped nor in
-    shadow; normal (n, 3) in the camera's frame; shown (n, lights), False where the photograph was left out."""
+    shadow; normal (n, 3) in the camera's frame; noise: of a sample that is rounded, over the median bright level; shown (n, lights), False
+    where the photograph was left out."""
 
     image: NDArray[np.float64]
     bright: Float

@@ -67,7 +67,7 @@ on 71 views of all materials, 11 in the median (docs/findings/one_view.md)."""
 
 SWEEPS = 5
 SHADOWED, BRIGHT_QUANTILE = 0.1, 0.8
-"""As in calibrate.py."""
+"""As in pixel_samples.py."""
 
 
 @dataclass(frozen=True)
