@@ -31,7 +31,7 @@ VERTICES, LIGHTS = 1000, 8
 SWEEPS = 20
 
 DARK, BRIGHT = 0.1, 0.8
-"""Samples below this part of a photograph's bright level, above this share of its vertices, are taken for shadow: as in pixel_samples.py."""
+"""Samples below this part of a photograph's bright level, above this share of its vertices, count as shadow: as in pixel_samples.py."""
 
 EXPLAINED = 1.6
 """Times what lights of each view's own leave, up to which lights of one rig explain the views."""
