@@ -50,7 +50,7 @@ from mvps.pixel_samples import BRIGHT_QUANTILE, PIXELS_PER_VIEW, SHADOWED, Pixel
 from mvps.scene import Capture, CaptureError, Float, Lights, Surface, View
 from mvps.sharing import shared_frame, vertex_samples
 from mvps.visibility import RayCaster, ray_caster
-from solvers.low_rank import Factorisation, factorise, robust_weights, solve_rows
+from solvers.low_rank import Factorisation, factorise, of_length_one, robust_weights, solve_rows
 
 MINIMUM_LIGHTS = 4
 """A rank-3 factorisation of three or fewer columns is exact for any data and so says nothing."""
@@ -196,10 +196,9 @@ def _under_normals(samples: list[PixelSamples]) -> list[Float]:
     """(lights, 3) intensity times direction in the frame of the samples' normals, for these as they are: albedo and lights in turn, after
     each number of sweeps of ALTERNATIONS."""
     of = pooled(samples)
-    # Where fewer lights than the brightest fifth reach a pixel its bright level is none, and what does would outweigh all else.
-    level = np.sqrt((of.known * of.image**2).sum(1) / np.maximum(of.known.sum(1), 1))
-    level = np.where(level > 0, level, 1.0)
-    image, known, normal, noise = of.image / level[:, None], of.known, of.normal, of.noise
+    known, normal, noise = of.known, of.normal, of.noise
+    # Where fewer lights than the brightest fifth reach a pixel its bright level is none.
+    image, level = of_length_one(of.image, known)
     if np.linalg.eigvalsh(normal.T @ normal)[0] < FINE_NORMAL**2 * len(normal):
         raise CaptureError(
             "lights: wanted a rough shape whose normals point many ways, given one where they all lie in one plane; use more views or"

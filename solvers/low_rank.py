@@ -48,6 +48,14 @@ def solve_rows(M: NDArray[Any], W: NDArray[Any], Y: NDArray[Any], ridge: float =
     return solution
 
 
+def of_length_one(M: NDArray[Any], known: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rows of M (m, n) over the root mean square of their known (m, n) samples, and these (m,), one where a row has none: all count alike,
+    where by their largest samples those that have few would outweigh all others."""
+    level = np.sqrt((known * M**2).sum(1) / np.maximum(known.sum(1), 1))
+    level = np.where(level > 0, level, 1.0)
+    return M / level[:, None], level
+
+
 def robust_weights(residual: NDArray[Any], known: NDArray[Any], floor: float) -> NDArray[np.float64]:
     """Cauchy weights of residuals (m, n), scale per row from its known entries; `floor` is the smallest scale (noise)."""
     # Unknown entries are sorted to the end: numpy's nanmedian is many times slower.

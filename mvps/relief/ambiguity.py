@@ -33,8 +33,9 @@ from scipy.optimize import least_squares
 
 from mvps.camera import pixel_centres
 from mvps.mesh import angles_deg, lengths, normalise
+from mvps.pixel_samples import BRIGHT_QUANTILE, SHADOWED
 from mvps.scene import Bool, Float, Int, View
-from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, robust_weights, solve_rows
+from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, of_length_one, robust_weights, solve_rows
 
 PAIRS, BLOCKS, BAND, FACTORED = 16000, 12000, 1000, 4000
 """Pairs of pixels, blocks of 2 x 2 cells and outline pixels that are drawn, and pixels that are factorised: nine unknowns against
@@ -66,8 +67,6 @@ FAR_DEG = 30.0
 on 71 views of all materials, 11 in the median (docs/findings/one_view.md)."""
 
 SWEEPS = 5
-SHADOWED, BRIGHT_QUANTILE = 0.1, 0.8
-"""As in pixel_samples.py."""
 
 
 @dataclass(frozen=True)
@@ -130,9 +129,7 @@ def factors(view: View, generator: np.random.Generator) -> Pseudo:
 def lights_under(view: View, rough: Float) -> Float:
     """(lights, 3) intensity times direction, camera frame, by least squares under rough normals (pixels, 3) as they are."""
     grey = _Relative(view)
-    # All pixels as bright: by their largest samples those that a few lights reach would outweigh all others.
-    level = np.sqrt((grey.known * grey.image**2).sum(1) / np.maximum(grey.known.sum(1), 1))
-    image = grey.image / np.where(level > 0, level, 1.0)[:, None]
+    image, _ = of_length_one(grey.image, grey.known)
     return solve_rows(image.T, grey.known.T.astype(np.float64), rough)
 
 
