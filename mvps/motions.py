@@ -31,6 +31,11 @@ class Object:
     centre: Float
     radius: float
 
+    @classmethod
+    def between(cls, low: Float, high: Float) -> Object:
+        """In the ball around a box with these corners (3,)."""
+        return cls((low + high) / 2, float(np.linalg.norm(high - low)) / 2)
+
 
 def units(camera: Camera, body: Object) -> tuple[Float, Float]:
     """The object's centre (3,) in the camera's frame, and what each unknown of a motion (6,) is in radians and world units a pixel."""

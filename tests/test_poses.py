@@ -1,8 +1,10 @@
-"""Poses: motions and misses have the stated derivatives, small pose errors are found and undone, right poses stay."""
+"""Cameras: motions and misses have the stated derivatives, small errors of poses and of the principal point are found and undone, right
+cameras stay."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -14,9 +16,11 @@ from scipy.spatial.transform import Rotation
 import mvps.checks.poses
 from mvps.camera import project
 from mvps.checks.coherence import coherence, jacobian
-from mvps.checks.outlines import by_other_half, outlines_of
+from mvps.checks.outlines import Motions, Unknowns, after, by_other_half, outlines_of
 from mvps.checks.photographed import confirmed
 from mvps.checks.poses import by_silhouettes, poses
+from mvps.checks.principal import Shared, pointed
+from mvps.checks.silhouettes import silhouettes
 from mvps.joint.blocks import Vertices
 from mvps.joint.bundle import Model, aligned
 from mvps.mesh import isotropic_remesh, vertex_normals
@@ -83,14 +87,18 @@ def test_gauge_is_what_similarities_of_the_world_undo(clean: Capture) -> None:
         assert np.abs(rest).max() < 1e-9 + 1e-6 * np.abs(moves).max()
 
 
-def test_misses_change_as_the_jacobian_says(clean: Capture) -> None:
+@pytest.mark.parametrize("of", [Motions(), Shared(np.eye(2)[::-1])], ids=["poses", "principal point"])
+def test_misses_change_as_the_jacobian_says(clean: Capture, of: Unknowns) -> None:
     outlines = outlines_of(with_motions(clean, outlines_of(clean).body, shifts(1.0)))
-    cameras = list(outlines.cameras)
-    found = coherence(cameras, outlines.fields, outlines.body, 2, outlines.points[2])
-    said = jacobian(cameras, outlines.fields, outlines.body, 2, found)
-    motions = np.random.default_rng(5).normal(0, 0.1, (VIEWS, UNKNOWNS))
-    ends = [coherence(outlines.after(side * motions), outlines.fields, outlines.body, 2, outlines.points[2]).miss for side in (-1, 1)]
-    true, expected = (ends[1] - ends[0]) / 2, np.einsum("njk,jk->n", said, motions)
+    found = coherence(outlines.cameras, outlines.fields, outlines.body, 2, outlines.points[2])
+    said = jacobian(outlines.cameras, outlines.fields, 2, found, partial(of.derivatives, outlines.body))
+    zero = of.zero(outlines.cameras)
+    x = np.random.default_rng(5).normal(0, 0.1, zero.shape)
+    moves = [after(outlines, of, side * x).cameras for side in (-1, 1)]
+    ends = [coherence(cameras, outlines.fields, outlines.body, 2, outlines.points[2]).miss for cameras in moves]
+    # What every camera does of a change that all share is gathered as its equations are.
+    each = x if x.ndim == 2 else np.tile(x @ np.eye(2)[::-1], (VIEWS, 1))
+    true, expected = (ends[1] - ends[0]) / 2, np.einsum("njk,jk->n", said, each)
     hit = np.abs(found.miss) < 5
     assert hit.sum() > 30
     assert np.median(np.abs(true - expected)[hit]) < 0.1 * np.median(np.abs(true)[hit])
@@ -98,9 +106,47 @@ def test_misses_change_as_the_jacobian_says(clean: Capture) -> None:
     assert np.corrcoef(true[hit], expected[hit])[0, 1] > 0.9
 
 
+def shifted(capture: Capture, shift: tuple[float, float]) -> Capture:
+    """The capture with the principal point of all views moved."""
+    cameras = Shared(np.eye(2)).applied([view.camera for view in capture.views], outlines_of(capture).body, np.array(shift))
+    return Capture(capture.name, tuple(view.taken_by(camera) for view, camera in zip(capture.views, cameras, strict=True)))
+
+
+@pytest.mark.parametrize("shift", [(1.5, -1.0), (-4.0, 5.0)])
+def test_a_principal_point_that_is_off_is_moved_and_the_world_stays(clean: Capture, shift: tuple[float, float]) -> None:
+    mended, (finding,) = poses(shifted(clean, shift))
+    assert (finding.about, finding.where, finding.mended) == ("pose", "all views", True)
+    assert "principal point" in finding.text
+    for one, view in zip(clean.views, mended.views, strict=True):
+        np.testing.assert_array_equal(view.camera.rotation, one.camera.rotation)
+        np.testing.assert_array_equal(view.camera.translation, one.camera.translation)
+        np.testing.assert_allclose(view.camera.K, one.camera.K, atol=0.3)
+
+
+def test_of_silhouettes_that_disagree_the_principal_point_is_mended_first(clean: Capture) -> None:
+    mended, findings = silhouettes(shifted(clean, (7.0, 3.0)))
+    assert [(one.about, one.mended) for one in findings] == [("pose", True)]
+    assert len(mended.views) == VIEWS
+
+
+def test_what_cameras_do_each_on_its_own_is_not_the_principal_point(clean: Capture) -> None:
+    body = outlines_of(clean).body
+    for pixels in (0.3, 1.0, 3.0):
+        wrong = with_motions(clean, body, shifts(pixels))
+        assert pointed(wrong) == (wrong, [])
+    assert pointed(clean) == (clean, [])
+
+
+def test_a_shift_along_the_axis_of_a_ring_is_in_doubt(clean: Capture) -> None:
+    """Cameras at one height all around: the world may have moved along the axis as well as the principal point."""
+    ring = Capture("ring", tuple(view for k, view in enumerate(clean.views) if k % 2 == 0))
+    _, findings = pointed(shifted(ring, (3.0, 0.0)))
+    assert [(one.about, one.mended) for one in findings] == [("pose", True), ("pose", False)]
+
+
 def test_right_poses_stay(clean: Capture) -> None:
-    after, findings = poses(clean)
-    assert after is clean
+    same, findings = poses(clean)
+    assert same is clean
     assert findings == []
 
 
@@ -148,13 +194,13 @@ def test_pose_errors_of_a_pixel_are_found_and_undone(clean: Capture) -> None:
     body, error = outlines_of(clean).body, shifts(1.0)
     # Too few lights for the photographs to be asked.
     wrong = with_motions(clean.select({view.name: view.lights[:2] for view in clean.views}), body, error)
-    after, findings = poses(wrong)
+    mended, findings = poses(wrong)
     assert [(one.about, one.where, one.mended) for one in findings] == [("pose", "all views", True)]
     outlines = outlines_of(wrong)
-    motions = by_silhouettes(outlines, np.zeros((VIEWS, UNKNOWNS)))
+    motions = by_silhouettes(outlines)
     assert motions is not None
     assert left(clean, body, error + motions) < 0.5 * left(clean, body, error)
-    for view, camera in zip(after.views, outlines.after(motions), strict=True):
+    for view, camera in zip(mended.views, after(outlines, Motions(), motions).cameras, strict=True):
         np.testing.assert_array_equal(view.camera.rotation, camera.rotation)
         assert view.samples is not None and view.mask is clean.views[int(view.name[5:]) - 1].mask
 
@@ -174,9 +220,9 @@ def test_the_other_half_decides(clean: Capture) -> None:
 
 def test_what_cannot_be_mended_is_said(clean: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong = with_motions(clean, outlines_of(clean).body, shifts(1.0))
-    monkeypatch.setattr(mvps.checks.poses, "by_silhouettes", lambda outlines, still: None)
-    after, (finding,) = poses(wrong)
-    assert after is wrong and not finding.mended
+    monkeypatch.setattr(mvps.checks.poses, "by_silhouettes", lambda outlines: None)
+    same, (finding,) = poses(wrong)
+    assert same is wrong and not finding.mended
     # Misses as small as the masks' noise makes them are no reason to doubt.
     monkeypatch.setattr(mvps.checks.poses, "misfit", lambda found: 0.2)
     assert poses(wrong) == (wrong, [])

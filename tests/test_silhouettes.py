@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation, binary_erosion
 
+import mvps.checks.silhouettes
 from mvps.checks.silhouettes import silhouettes
 from mvps.load import read_capture
 from mvps.scene import Bool, Camera, Capture, View
@@ -122,14 +123,19 @@ def test_a_view_with_anothers_pose_is_left_out(sound: Capture, like: int) -> Non
     assert [(one.about, one.where, one.mended) for one in findings] == [("pose", THIRD, True)]
 
 
-def test_small_errors_of_all_poses_are_left_alone(sound: Capture) -> None:
+def shaken(capture: Capture, pixels: float) -> Capture:
+    """Every camera moved aside, so that the object's projection moves by so many pixels."""
     rng = np.random.default_rng(0)
     views = []
-    for view in sound.views:
+    for view in capture.views:
         angle, pixel = rng.uniform(0, 2 * np.pi), view.camera.translation[2] / view.camera.focal_length
-        moved = view.camera.translation + 3 * pixel * np.array([np.cos(angle), np.sin(angle), 0])
+        moved = view.camera.translation + pixels * pixel * np.array([np.cos(angle), np.sin(angle), 0])
         views.append(replace(view, camera=replace(view.camera, translation=moved)))
-    capture = Capture("shaken", tuple(views))
+    return Capture("shaken", tuple(views))
+
+
+def test_small_errors_of_all_poses_are_left_alone(sound: Capture) -> None:
+    capture = shaken(sound, 3)
     left, findings = silhouettes(capture)
     assert left is capture and not findings
 
@@ -143,13 +149,30 @@ def test_what_no_view_alone_explains_is_said_and_left(sound: Capture) -> None:
     assert [(one.where, one.mended) for one in findings] == [("all views", False)]
 
 
-def test_of_two_views_with_one_pose_both_are_named(sound: Capture) -> None:
-    """Seen from opposite sides an object's outlines are mirror images: the hull cannot tell which of the two is wrong."""
-    views = [posed(view, sound.views[6]) if view.name == THIRD else view for view in sound.views]
-    capture = Capture("opposite", tuple(views))
+def opposite(capture: Capture) -> Capture:
+    """The third view with the pose of one from about the other side, where an object's outline is its mirror image: hulls cannot tell."""
+    return Capture("opposite", tuple(posed(view, capture.views[6]) if view.name == THIRD else view for view in capture.views))
+
+
+def test_of_two_views_with_one_pose_lines_of_sight_tell_the_wrong_one(sound: Capture) -> None:
+    left, findings = silhouettes(opposite(sound))
+    assert [view.name for view in left.views] == [view.name for view in sound.views if view.name != THIRD]
+    assert [(one.where, one.mended) for one in findings] == [(THIRD, True)]
+
+
+def test_of_two_views_with_one_pose_both_are_named_where_nothing_tells(sound: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mvps.checks.silhouettes, "_wrong", lambda cones, among, suspects: None)
+    capture = opposite(sound)
     left, findings = silhouettes(capture)
     assert left is capture
     assert [(one.where, one.mended) for one in findings] == [(THIRD, False), ("view_07", False)]
+
+
+def test_where_the_others_do_not_agree_either_no_view_is_left_out(sound: Capture) -> None:
+    capture = opposite(shaken(sound, 1.5))
+    left, findings = silhouettes(capture)
+    assert left is capture
+    assert [(one.where, one.mended) for one in findings] == [("all views", False)]
 
 
 def test_what_the_image_cuts_off_is_no_contradiction(sound: Capture) -> None:

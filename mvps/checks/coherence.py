@@ -15,6 +15,7 @@ which moves the projection, and of camera i, which carries the line along.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from skimage.measure import find_contours
 
 from mvps.camera import project, rays
-from mvps.motions import UNKNOWNS, Object, derivatives, image_derivatives, units
+from mvps.motions import Object, image_derivatives, units
 from mvps.scene import Bool, Camera, Float, Int
 from mvps.silhouette import sampled
 
@@ -33,6 +34,9 @@ PROBE_PIXELS = 0.5
 """Half the step of the difference quotient that stands for the gradient of m, which is smooth over a pixel."""
 
 Fields = list[NDArray[np.float32]]
+
+Derivatives = Callable[[Camera, Float], Float]
+"""(n, 3, u) of points (n, 3) in a camera's frame: what each of the camera's u unknowns moves them by, or moves their projections like."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +64,7 @@ def outline_points(field: NDArray[np.float32], spacing: float) -> Float:
     return np.concatenate(found) if found else np.zeros((0, 2))
 
 
-def _along(cameras: list[Camera], fields: Fields, own: int, origins: Float, directions: Float, t: Float) -> tuple[Float, Int]:
+def _along(cameras: Sequence[Camera], fields: Fields, own: int, origins: Float, directions: Float, t: Float) -> tuple[Float, Int]:
     """Largest m (n, T) of all views but `own` at depths t (n, T) along lines of sight, and whose it is."""
     largest = np.full(t.shape, -np.inf, np.float32)
     whose = np.zeros(t.shape, np.int16)
@@ -76,7 +80,7 @@ def _along(cameras: list[Camera], fields: Fields, own: int, origins: Float, dire
     return largest, whose
 
 
-def coherence(cameras: list[Camera], fields: Fields, body: Object, own: int, image: Float) -> Coherence:
+def coherence(cameras: Sequence[Camera], fields: Fields, body: Object, own: int, image: Float) -> Coherence:
     """The miss at outline points `image` (n, 2) of view `own`."""
     camera = cameras[own]
     origins, directions = rays(camera, image)
@@ -105,13 +109,13 @@ def gradients(field: NDArray[np.float32], image: Float) -> Float:
     return np.stack([(b - a) / (2 * PROBE_PIXELS) for a, b in ends], -1).astype(np.float64)
 
 
-def jacobian(cameras: list[Camera], fields: Fields, body: Object, own: int, found: Coherence) -> Float:
-    """(n, cameras, 6) derivatives of the misses of view `own` by the motions of all cameras."""
-    result = np.zeros((len(found.miss), len(cameras), UNKNOWNS))
+def jacobian(cameras: Sequence[Camera], fields: Fields, own: int, found: Coherence, derivatives: Derivatives) -> Float:
+    """(n, cameras, u) derivatives of the misses of view `own` by the unknowns of all cameras."""
     own_local = found.point @ cameras[own].rotation.T + cameras[own].translation
-    carried = derivatives(cameras[own], body, own_local)
+    carried = derivatives(cameras[own], own_local)
     # Along the line of sight e does not change, but a camera's distance moves the point far along it.
     carried -= own_local[..., None] / own_local[:, 2, None, None] * carried[:, 2:]
+    result = np.zeros((len(found.miss), len(cameras), carried.shape[2]))
     for side in range(2):
         for j in np.unique(found.against[:, side]):
             rows = np.flatnonzero(found.against[:, side] == j)
@@ -119,7 +123,7 @@ def jacobian(cameras: list[Camera], fields: Fields, body: Object, own: int, foun
             slope = np.einsum("nk,nkc->nc", gradients(fields[j], project(camera, points)[0]), image_derivatives(camera, points))
             slope *= found.weight[rows, side, None]
             local = points @ camera.rotation.T + camera.translation
-            result[rows, j] += np.einsum("nc,ncp->np", slope, derivatives(camera, body, local))
+            result[rows, j] += np.einsum("nc,ncp->np", slope, derivatives(camera, local))
             relative = camera.rotation @ cameras[own].rotation.T
             result[rows, own] -= np.einsum("nc,ncp->np", slope @ relative, carried[rows])
     return result

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from mvps.camera import footprint, inside_image, project, rays
 from mvps.mesh import lengths
+from mvps.motions import Object
 from mvps.scene import Bool, Camera, Capture, Float
 from mvps.silhouette import beyond_mask, mask_distances
 
@@ -83,6 +84,10 @@ class Cones:
                 break
             low, high = self.points.min(0) - spacing, self.points.max(0) + spacing
         self._at = [self._pixels(view.camera) for view in capture.views]
+
+    def body(self) -> Object | None:
+        """Where the object is, whatever a few wrong views say; None where nothing is left of it."""
+        return Object.between(self.points.min(0), self.points.max(0)) if len(self.points) else None
 
     def _kept(self, points: Float, fields: Sequence[NDArray[np.float32]]) -> tuple[Float, Bool]:
         """Points that no more views exclude than may be wrong and one more, and which do."""

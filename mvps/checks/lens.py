@@ -22,7 +22,6 @@ from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.material import CERTAIN
 from mvps.mesh import lengths
-from mvps.motions import UNKNOWNS
 from mvps.scene import Camera, Capture, Float, View
 
 LEAST_VIEWS = 3
@@ -49,9 +48,9 @@ def lens(capture: Capture) -> tuple[Capture, list[Finding]]:
     if len(capture.views) < LEAST_VIEWS or by < TOLD:
         return capture, [Finding("pose", "all views", f"{given}; {taken}", True)]
     straight = Capture(capture.name, tuple(on_cores(straightened, capture.views)))
-    still, outlines = np.zeros((len(capture.views), UNKNOWNS)), outlines_of(capture)
+    outlines = outlines_of(capture)
     points = [free_of_lens(camera, points) for camera, points in zip(outlines.cameras, outlines.points, strict=True)]
-    as_given, undone = outlines.misses(still), replace(outlines_of(straight), points=points).misses(still)
+    as_given, undone = outlines.misses(), replace(outlines_of(straight), points=points).misses()
     fall, error = fallen(as_given, undone)
     left = f"lines of sight along the outlines miss by {misfit(as_given):.2f} px as photographs are, by {misfit(undone):.2f} without it"
     if fall > CERTAIN * error and misfit(as_given) > NOISE:

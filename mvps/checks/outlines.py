@@ -1,32 +1,40 @@
-"""Poses from silhouettes: cameras moved until lines of sight along the outlines touch what the other views leave of the object.
+"""Cameras from silhouettes: changed until lines of sight along the outlines touch what the other views leave of the object.
 
-The miss e of coherence.py counts where it is positive. Over all outline points q, with motions x of the cameras (motions.py),
+The miss e of coherence.py counts where it is positive. Over all outline points q, with unknowns x of the cameras in pixels (motions of
+each, motions.py; or a principal point that all share, principal.py),
 
     sum_q rho(max(e_q(x), 0)) + (MASK_NOISE / misfit)^2 |x|^2
 
 is made small by damped Gauss-Newton steps (Levenberg 1944, Marquardt 1963), rho Cauchy's. Cameras start within about the misfit of where
 they belong, which is the second term.
 
-Outlines are cut into quarters, and two that do not touch are held out. A pose that is wrong shows in both halves; a mask's staircase does
+Outlines are cut into quarters, and two that do not touch are held out. A camera that is wrong shows in both halves; a mask's staircase does
 not, which a straight edge has along all of its length.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 
 from mvps.checks.coherence import Coherence, Fields, coherence, jacobian, outline_points
 from mvps.cores import on_cores
 from mvps.hull import bounds
-from mvps.motions import UNKNOWNS, Object, gauge, moved, without_gauge
+from mvps.motions import UNKNOWNS, Object, derivatives, gauge, moved, without_gauge
 from mvps.scene import Camera, Capture, Float
 from mvps.silhouette import STAIRCASE_PIXELS, mask_distances
 from solvers.low_rank import CAUCHY_95
 
 MASK_NOISE = float((12 * 2 * np.sqrt(np.pi) * STAIRCASE_PIXELS) ** -0.5)
 """Standard deviation, 0.15 pixels, of an outline that is rounded to pixels and smoothed: a Gaussian averages 2 sqrt(pi) sigma of them."""
+
+DOUBTFUL_PIXELS = 2 * MASK_NOISE
+"""Mean of the positive misses from which cameras and masks contradict each other: a miss has the noise of two views' masks, and is the
+largest of several."""
 
 LEAST_SPACING, MOST_POINTS = 4.0, 2000
 """Pixels between outline points: beyond three the smoothed staircase of a mask (silhouette.py) is another. Points of all views: a tenth of
@@ -52,6 +60,11 @@ class Outlines:
     body: Object
     points: list[Float]
 
+    def among(self, views: Sequence[int]) -> Outlines:
+        """Only some of the views."""
+        cameras = tuple(self.cameras[j] for j in views)
+        return Outlines(cameras, [self.fields[j] for j in views], self.body, [self.points[j] for j in views])
+
     def half(self, which: int) -> Outlines:
         """Only every other part of each view's outline: the odd or the even ones."""
 
@@ -60,26 +73,63 @@ class Outlines:
             chosen: Float = points[part % 2 == which]
             return chosen
 
-        return Outlines(self.cameras, self.fields, self.body, [of(points) for points in self.points])
+        return replace(self, points=[of(points) for points in self.points])
 
-    def after(self, motions: Float) -> list[Camera]:
-        """The cameras after motions (views, 6)."""
-        return [moved(camera, self.body, motion) for camera, motion in zip(self.cameras, motions, strict=True)]
-
-    def misses(self, motions: Float) -> list[Coherence]:
-        """The misses of all views after motions."""
-        cameras = self.after(motions)
-        return on_cores(lambda i: coherence(cameras, self.fields, self.body, i, self.points[i]), range(len(cameras)))
+    def misses(self) -> list[Coherence]:
+        """The misses of all views."""
+        return on_cores(lambda i: coherence(self.cameras, self.fields, self.body, i, self.points[i]), range(len(self.cameras)))
 
 
-def outlines_of(capture: Capture) -> Outlines:
-    """The outlines of all masks. CaptureError where the masks enclose no object."""
+class Unknowns(Protocol):
+    """Numbers x, in pixels, by which cameras may be wrong."""
+
+    def zero(self, cameras: Sequence[Camera]) -> Float:
+        """x of cameras as they are."""
+
+    def applied(self, cameras: Sequence[Camera], body: Object, x: Float) -> tuple[Camera, ...]:
+        """The cameras after x."""
+
+    def derivatives(self, body: Object, camera: Camera, local: Float) -> Float:
+        """(n, 3, u) of points (n, 3) in a camera's frame, by what x may do to this camera."""
+
+    def gathered(self, hessian: Float, gradient: Float) -> tuple[Float, Float]:
+        """The equations of x from those of all cameras, (views, u, views, u) and (views, u)."""
+
+    def free(self, cameras: Sequence[Camera], body: Object, change: Float) -> Float:
+        """The part of a change of x that photographs show."""
+
+
+class Motions:
+    """Every camera on its own: motions (views, 6)."""
+
+    def zero(self, cameras: Sequence[Camera]) -> Float:
+        """See Unknowns."""
+        return np.zeros((len(cameras), UNKNOWNS))
+
+    def applied(self, cameras: Sequence[Camera], body: Object, x: Float) -> tuple[Camera, ...]:
+        """See Unknowns."""
+        return tuple(moved(camera, body, motion) for camera, motion in zip(cameras, x, strict=True))
+
+    def derivatives(self, body: Object, camera: Camera, local: Float) -> Float:
+        """See Unknowns."""
+        return derivatives(camera, body, local)
+
+    def gathered(self, hessian: Float, gradient: Float) -> tuple[Float, Float]:
+        """See Unknowns."""
+        return hessian.reshape(gradient.size, gradient.size), gradient.ravel()
+
+    def free(self, cameras: Sequence[Camera], body: Object, change: Float) -> Float:
+        """The mean pose stays."""
+        return without_gauge(change, gauge(cameras, body))
+
+
+def outlines_of(capture: Capture, body: Object | None = None) -> Outlines:
+    """The outlines of all masks. body: where the object is, in the masks' bounds if None, with a CaptureError where they enclose none."""
     fields = mask_distances(capture)
     points = on_cores(lambda field: outline_points(field, LEAST_SPACING), fields)
     every = -(-sum(len(of_view) for of_view in points) // MOST_POINTS) or 1
-    low, high = bounds(capture)
-    body = Object((low + high) / 2, float(np.linalg.norm(high - low)) / 2)
-    return Outlines(tuple(view.camera for view in capture.views), fields, body, [of_view[::every] for of_view in points])
+    within = body or Object.between(*bounds(capture))
+    return Outlines(tuple(view.camera for view in capture.views), fields, within, [of_view[::every] for of_view in points])
 
 
 def positive(found: list[Coherence]) -> Float:
@@ -93,65 +143,87 @@ def misfit(found: list[Coherence]) -> float:
     return float(miss[miss > 0].mean()) if (miss > 0).any() else 0.0
 
 
+def in_words(found: list[Coherence]) -> str:
+    """The misfit, as a finding begins."""
+    return f"lines of sight along the outlines miss what the other views leave of the object by {misfit(found):.2f} px in the mean"
+
+
 def _certain(found: list[Coherence]) -> float:
     """The misfit, at least a mask's noise."""
     return max(misfit(found), MASK_NOISE)
 
 
-def _equations(outlines: Outlines, motions: Float, found: list[Coherence], scale: float) -> tuple[Float, Float]:
-    """Hessian (6 views, 6 views) and gradient (6 views,) of the misses under Cauchy's weights."""
-    cameras, unknowns = outlines.after(motions), UNKNOWNS * len(motions)
-    hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+def _scale(found: list[Coherence]) -> float:
+    """Of Cauchy's weights, pixels."""
+    return CAUCHY_95 * _certain(found)
+
+
+def after(outlines: Outlines, of: Unknowns, x: Float) -> Outlines:
+    """The outlines with the cameras after x."""
+    return replace(outlines, cameras=of.applied(outlines.cameras, outlines.body, x))
+
+
+def equations(outlines: Outlines, of: Unknowns, found: list[Coherence]) -> tuple[Float, Float]:
+    """Hessian and gradient by x of the misses, found with these cameras, under Cauchy's weights."""
+    cameras, by, scale = outlines.cameras, partial(of.derivatives, outlines.body), _scale(found)
+    hessian, gradient = np.zeros(1), np.zeros(1)
     for i, one in enumerate(found):
         part = one.of(one.miss > 0)
-        slope = jacobian(cameras, outlines.fields, outlines.body, i, part).reshape(-1, unknowns)
+        by_camera = jacobian(cameras, outlines.fields, i, part, by)
+        slope = by_camera.reshape(len(by_camera), by_camera.shape[1] * by_camera.shape[2])
         weighted = slope / (1 + (part.miss[:, None] / scale) ** 2)
-        hessian += weighted.T @ slope
-        gradient += weighted.T @ part.miss
-    return hessian, gradient
+        hessian = hessian + weighted.T @ slope
+        gradient = gradient + weighted.T @ part.miss
+    views = len(cameras)
+    each = len(gradient) // views
+    return of.gathered(hessian.reshape(views, each, views, each), gradient.reshape(views, each))
 
 
-def _cost(found: list[Coherence], motions: Float, tie: float, scale: float) -> float:
-    return float(scale**2 * np.log1p((positive(found) / scale) ** 2).sum() + tie * (motions**2).sum())
+def _cost(found: list[Coherence], x: Float, tie: float, scale: float) -> float:
+    return float(scale**2 * np.log1p((positive(found) / scale) ** 2).sum() + tie * (x**2).sum())
 
 
 def tie_of(found: list[Coherence]) -> float:
-    """What a motion of one pixel costs where the misses at first are `found`, in squared pixels of misses: (MASK_NOISE / misfit)^2."""
+    """What an unknown of one pixel costs where the misses at first are `found`, in squared pixels of misses: (MASK_NOISE / misfit)^2."""
     return float((MASK_NOISE / _certain(found)) ** 2)
 
 
-def step(outlines: Outlines, motions: Float, found: list[Coherence], tie: float, damping: float = FIRST_DAMPING) -> Float:
-    """The motions (views, 6) after one Gauss-Newton step from `motions`, where the misses are `found`; the mean pose stays."""
-    hessian, gradient = _equations(outlines, motions, found, CAUCHY_95 * _certain(found))
-    change = -np.linalg.solve(hessian + (tie + damping) * np.eye(len(hessian)), gradient + tie * motions.ravel())
-    return motions + without_gauge(change.reshape(motions.shape), gauge(outlines.after(motions), outlines.body))
+def step(outlines: Outlines, of: Unknowns, x: Float, found: list[Coherence], tie: float, damping: float = FIRST_DAMPING) -> Float:
+    """x after one Gauss-Newton step, where the misses after x are `found`."""
+    there = after(outlines, of, x)
+    hessian, gradient = equations(there, of, found)
+    change = -np.linalg.solve(hessian + (tie + damping) * np.eye(len(hessian)), gradient + tie * x.ravel())
+    return x + of.free(there.cameras, outlines.body, change.reshape(x.shape))
 
 
-def fitted(outlines: Outlines, motions: Float, tie: float, bound: float) -> Float:
-    """Motions (views, 6), each unknown within +-bound pixels, after which the outlines miss least, starting at `motions`."""
-    found, damping = outlines.misses(motions), FIRST_DAMPING
+def fitted(outlines: Outlines, of: Unknowns, x: Float, tie: float, bound: float) -> Float:
+    """x, each unknown within +-bound pixels, after which the outlines miss least, starting at `x`."""
+    found, damping = after(outlines, of, x).misses(), FIRST_DAMPING
     for _ in range(MOST_STEPS):
-        scale = CAUCHY_95 * _certain(found)
-        trial = np.clip(step(outlines, motions, found, tie, damping), -bound, bound)
-        then = outlines.misses(trial)
-        if _cost(then, trial, tie, scale) >= _cost(found, motions, tie, scale):
+        scale = _scale(found)
+        trial = np.clip(step(outlines, of, x, found, tie, damping), -bound, bound)
+        moved_by = float(np.sqrt(((trial - x) ** 2).mean()))
+        then = after(outlines, of, trial).misses()
+        better = _cost(then, trial, tie, scale) < _cost(found, x, tie, scale)
+        # A step that is short for its damping says nothing; one that is shorter by far and no better, that there is none.
+        if moved_by < (STILL_PIXELS if better else STILL_PIXELS / 10):
+            return trial if better else x
+        if better:
+            x, found, damping = trial, then, damping / 2
+        else:
             damping *= 4
-            continue
-        moved_by = float(np.sqrt(((trial - motions) ** 2).mean()))
-        motions, found, damping = trial, then, damping / 2
-        if moved_by < STILL_PIXELS:
-            break
-    return motions
+    return x
 
 
 def by_other_half(outlines: Outlines) -> tuple[float, float]:
-    """By how much the positive misses of every half of the points fall, mean in pixels, after one step that the other half asks for, and
-    the standard error of that."""
-    halves, still = [outlines.half(k) for k in range(2)], np.zeros((len(outlines.cameras), UNKNOWNS))
-    before = [half.misses(still) for half in halves]
-    asked = [step(half, still, found, tie_of(found)) for half, found in zip(halves, before, strict=True)]
-    after = [half.misses(motions) for half, motions in zip(halves, reversed(asked), strict=True)]
-    return fallen([one for half in before for one in half], [one for half in after for one in half])
+    """By how much the positive misses of every half of the points fall, mean in pixels, after one step of all cameras that the other half
+    asks for, and the standard error of that."""
+    halves, of = [outlines.half(k) for k in range(2)], Motions()
+    still = of.zero(outlines.cameras)
+    before = [half.misses() for half in halves]
+    asked = [step(half, of, still, found, tie_of(found)) for half, found in zip(halves, before, strict=True)]
+    then = [after(half, of, motions).misses() for half, motions in zip(halves, reversed(asked), strict=True)]
+    return fallen([one for half in before for one in half], [one for half in then for one in half])
 
 
 def fallen(before: list[Coherence], after: list[Coherence]) -> tuple[float, float]:

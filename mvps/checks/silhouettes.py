@@ -3,6 +3,7 @@
 In this order, each mended before the next is looked at:
 
 mask    grown or shrunk as a whole: the edge of what the photographs show lit is not where the mask ends (lit.py)
+point   silhouettes that disagree, and one shift of all principal points explains it (principal.py): moved
 part    dark under all lights, at the mask's rim, and outside the hull of the other views or apart from the rest: taken out; lit, outside
         the mask or in a hole of it, and inside the hull of the other views: given back. A hole that shows the background stays
 view    silhouettes that disagree (cones.py): where all others agree without a view, and without no other, that view's pose is not that of
@@ -18,11 +19,15 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import binary_opening, binary_propagation
 
+from mvps.checks.coherence import Coherence
 from mvps.checks.cones import ENOUGH, Cones, wrong_at_most
 from mvps.checks.lit import BLOCK, Lit, lit_part, missing_parts, moved, steps, stray_parts
+from mvps.checks.outlines import DOUBTFUL_PIXELS, fallen, misfit, outlines_of
+from mvps.checks.principal import pointed
 from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.load import with_mask
+from mvps.material import CERTAIN
 from mvps.scene import Bool, Capture, View
 
 FEWEST = 3
@@ -31,10 +36,18 @@ FEWEST = 3
 
 def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
     """The capture with masks mended and wrong views left out, and what was found."""
-    mended, of_masks = _moved(capture)
-    mended, of_parts = _parted(mended)
-    left, of_views = _left_out(mended)
-    return left, [*of_masks, *of_parts, *of_views]
+    mended, findings = _moved(capture)
+    if len(mended.views) < FEWEST:
+        return mended, findings
+    cones = Cones(mended)
+    body = cones.body()
+    if body is not None and max(cones.uncovered(range(len(mended.views)))) > ENOUGH:
+        mended, of_point = pointed(mended, body)
+        cones = Cones(mended) if of_point else cones
+        findings = [*findings, *of_point]
+    mended, of_parts = _parted(cones)
+    left, of_views = _left_out(Cones(mended) if of_parts else cones)
+    return left, [*findings, *of_parts, *of_views]
 
 
 def _seen(view: View) -> tuple[Lit | None, Bool | None]:
@@ -65,10 +78,9 @@ def _moved(capture: Capture) -> tuple[Capture, list[Finding]]:
     return Capture(capture.name, tuple(views)), [Finding("mask", where, text, True)]
 
 
-def _parted(capture: Capture) -> tuple[Capture, list[Finding]]:
-    """Masks without what is none of the object and with what they lack of it."""
-    if len(capture.views) < FEWEST:
-        return capture, []
+def _parted(cones: Cones) -> tuple[Capture, list[Finding]]:
+    """The capture, its masks without what is none of the object and with what they lack of it."""
+    capture = cones.capture
 
     def parts_of(view: View) -> tuple[list[Bool], list[Bool]]:
         found = lit_part(view, steps(view.mask))
@@ -79,7 +91,7 @@ def _parted(capture: Capture) -> tuple[Capture, list[Finding]]:
     parts = on_cores(parts_of, capture.views)
     if not any(stray or missing for stray, missing in parts):
         return capture, []
-    cones, views = Cones(capture), list(capture.views)
+    views = list(capture.views)
     gone, back = dict[str, int](), dict[str, int]()
     for at, (stray, missing) in enumerate(parts):
         view = views[at]
@@ -121,29 +133,42 @@ def _needless(cones: Cones, view: int, part: Bool) -> bool:
     return bool((binary_propagation(part, BLOCK, mask) == part).all())
 
 
-def _left_out(capture: Capture) -> tuple[Capture, list[Finding]]:
+def _left_out(cones: Cones) -> tuple[Capture, list[Finding]]:
     """The capture without views whose silhouettes contradict the others'."""
-    if len(capture.views) <= FEWEST:
+    capture = cones.capture
+    among = list(range(len(capture.views)))
+    if len(among) <= FEWEST:
         return capture, []
-    cones, among = Cones(capture), list(range(len(capture.views)))
     names, most = [view.name for view in capture.views], wrong_at_most(len(capture.views))
     counts = at_first = cones.uncovered(among)
     findings: list[Finding] = []
     while max(counts) > ENOUGH and len(findings) < most and len(among) > FEWEST:
         left = [cones.uncovered([j for j in among if j != k]) for k in among]
-        order = np.argsort([sum(one) for one in left])
-        best, second = order[0], order[1]
-        # Where without either of two views the others agree as well, nothing says which of them is wrong.
-        if sum(left[second]) <= sum(left[best]) + ENOUGH:
+        sums = np.array([sum(one) for one in left])
+        best = int(sums.argmin())
+        alike = [among[k] for k in np.flatnonzero(sums <= sums[best] + ENOUGH)]
+        # Where without either of two views the others' hulls cover masks as well, lines of sight along outlines say more.
+        wrong = _wrong(cones, among, alike) if len(alike) > 1 else among[best]
+        if wrong is None:
             break
+        best = among.index(wrong)
         text = (
             f"its silhouette contradicts the others' ({sum(counts)} pixels of the masks outside the other views' hull with it,"
-            f" {sum(left[best])} without): its pose is not that of its photographs; left out"
+            f" {sums[best]} without): its pose is not that of its photographs; left out"
         )
         findings.append(Finding("pose", names[among.pop(best)], text, True))
         counts = left[best]
     for pair in _twins([capture.views[at] for at in among]):
         both = [names.index(view.name) for view in pair]
+        if not {*both} <= {*among}:
+            continue
+        wrong = _wrong(cones, among, both)
+        if wrong is not None and len(findings) < most:
+            right = names[both[both[0] == wrong]]
+            text = f"it has the pose of {right}, and the others' silhouettes agree with that of {right}, not with its own: left out"
+            findings.append(Finding("pose", names[wrong], text, True))
+            among.remove(wrong)
+            continue
         out = len(findings) + len(both) <= most
         among = [at for at in among if at not in both] if out else among
         for view, other in (pair, pair[::-1]):
@@ -158,6 +183,24 @@ def _left_out(capture: Capture) -> tuple[Capture, list[Finding]]:
         )
         return capture, [Finding("pose", "all views", text, False)]
     return (Capture(capture.name, tuple(capture.views[at] for at in among)) if len(among) < len(names) else capture), findings
+
+
+def _wrong(cones: Cones, among: Sequence[int], suspects: Sequence[int]) -> int | None:
+    """The one of some suspect views without which lines of sight along the outlines of all others, `among` these, meet what other views
+    leave of the object; None where there is none, or without another they do as well."""
+    body = cones.body()
+    if body is None:
+        return None
+    outlines = outlines_of(cones.capture, body)
+    rest = {k: [j for j in among if j != k] for k in suspects}
+    misses = {k: outlines.among(rest[k]).misses() for k in suspects}
+    best, second = sorted(suspects, key=lambda k: misfit(misses[k]))[:2]
+
+    def of_others(without: int) -> list[Coherence]:
+        return [one for j, one in zip(rest[without], misses[without], strict=True) if j not in (best, second)]
+
+    fall, error = fallen(of_others(second), of_others(best))
+    return best if misfit(misses[best]) <= DOUBTFUL_PIXELS and fall > CERTAIN * error else None
 
 
 def _twins(views: Sequence[View]) -> list[tuple[View, View]]:
