@@ -24,20 +24,24 @@ def all_lights(
     import numpy as np
 
     from mvps.joint.held_out import carried_over, fit_lights
+    from mvps.joint.strengths import strengths_of
 
+    strengths = strengths_of(lights)
     known: dict[tuple[str, int], tuple[Any, Any]] = {}
     for view, directions, intensities in zip(used.views, lights.direction, lights.intensity, strict=True):
         known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
     if held is not None and lights.one_rig:
         for view in held.views:
             directions, intensities = carried_over(lights, used.views[0].camera, view.camera)
+            # How bright a view is that was not used, nothing says.
+            intensities = intensities / (strengths[0] if strengths else 1.0)
             rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
             known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
     if held is not None:
         unknown = {view.name: [n for n in view.lights if (view.name, n) not in known] for view in held.views}
         rest = held.select({name: numbers for name, numbers in unknown.items() if numbers}) if any(unknown.values()) else None
         if rest is not None:
-            shared = lights.one_rig and len({view.lights for view in rest.views}) == 1
+            shared = lights.one_rig and strengths is None and len({view.lights for view in rest.views}) == 1
             fitted = fit_lights(rest, surface, material, shared, device, shared and lights.fixed)
             for view, directions, intensities in zip(rest.views, fitted.direction, fitted.intensity, strict=True):
                 known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
@@ -103,6 +107,7 @@ def told(
     used: what it was made from; settings: plain values; complete, pictures: lights and normals of all views, of those used their pixels'
     own, which the verdict compares and the result draws to the surface; findings: of the capture's checks; words: to end the verdict with.
     """
+    from mvps.joint.strengths import strengths_of
     from mvps.measures import held_out_photographs, held_out_views, photograph_errors
     from mvps.nearness import nearness
     from mvps.verdict import signs, verdict
@@ -120,6 +125,11 @@ def told(
             said = "brightness falls off across the object as it does under near lights, which are taken for directional ones: normals lean"
             findings = [*findings, Finding("lights", "all views", f"{said} ({near.slope:.3f}, far lights 0)", False)]
             text = f"{text} But {said}."
+        strengths = strengths_of(refined.lights)
+        if strengths:
+            said = f"photographs are, view by view, {min(strengths):.2f} to {max(strengths):.2f} times as bright as one rig makes them:"
+            said += " exposures that differ, which were solved; intensities of the lights hold them"
+            findings = [*findings, Finding("lights", "all views", said, True)]
         drawn = dict(zip((view.name for view in used.views), drawn_to_surface(used, refined.surface, of_used), strict=True))
         stage.status(status)
     metrics = {"stages": progress.stages, "rounds": rounds, "status": {"name": status, "text": f"{text} {words}".strip(), **found}}

@@ -68,6 +68,14 @@ def test_eight_bits_are_multiples_of_257(made: tuple[Capture, Truth]) -> None:
         assert (bad.samples % 257 == 0).all() and np.abs(bad.samples.astype(int) - good.samples).max() <= 129
 
 
+def test_exposures_differ_from_view_to_view_and_clip_nothing(made: tuple[Capture, Truth]) -> None:
+    good, bad = (capture.views for capture in (made[0], damage.exposed_anew(made[0], 0.4, rng())))
+    level = np.array([b.samples.sum() / g.samples.sum() for g, b in zip(good, bad, strict=True)])
+    assert level.max() == pytest.approx(1, abs=1e-3) and level.min() < 0.8
+    for g, b, factor in zip(good, bad, level, strict=True):
+        np.testing.assert_allclose(b.samples, factor * g.samples.astype(float), atol=1)
+
+
 def test_gamma_is_undone_by_its_power(made: tuple[Capture, Truth]) -> None:
     harmed = damage.gamma(made[0], 2.2, rng())
     assert np.abs(harmed.views[1].radiance() ** 2.2 - made[0].views[1].radiance()).max() < 1e-4

@@ -52,6 +52,13 @@ def fewer_bits(capture: Capture, bits: float, rng: np.random.Generator) -> Captu
     return each_view(capture, lambda view: with_values(view, np.rint(view.radiance() * top) / top))
 
 
+def exposed_anew(capture: Capture, spread: float, rng: np.random.Generator) -> Capture:
+    """Every view with an exposure of its own, of this standard deviation of its logarithm; the longest as it was, none clipped."""
+    exposure = np.exp(rng.normal(0, spread, len(capture.views)))
+    exposures = iter(exposure / exposure.max())
+    return each_view(capture, lambda view: with_values(view, view.radiance() * next(exposures)))
+
+
 def gamma(capture: Capture, exponent: float, rng: np.random.Generator) -> Capture:
     """Code values radiance^(1 / exponent)."""
     return each_view(capture, lambda view: with_values(view, view.radiance() ** (1 / exponent)))

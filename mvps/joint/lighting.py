@@ -17,8 +17,9 @@ from mvps.joint.patches import Patches
 from mvps.joint.reflectance import Observed
 from mvps.joint.state import State
 from mvps.joint.steps import Anchor, possible, vertex_step
+from mvps.joint.strengths import exposed_alike, strengths_in, strengths_of
 from mvps.mesh import angles_deg, edges, lengths
-from mvps.scene import Capture, Lights, Surface
+from mvps.scene import Capture, Law, Lights, Surface
 
 LIGHT_VERTICES = 4000
 """Vertices, in patches, that stand for all when lights are solved."""
@@ -63,8 +64,10 @@ def solved_lights(
     patches: Patches,
     free_lights: bool,
     of_law: OfLaw,
+    compare: bool,
 ) -> tuple[Lights, float]:
     """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
+    compare: look whether views under one rig are exposed alike; where they are not, how bright each is is solved as well.
 
     Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
     """
@@ -74,13 +77,25 @@ def solved_lights(
     few, part, tie = subset(few, vertices, anchor, patches.vertex)
     rotations = [tensor32(rig_frame(state.lights, view.camera), patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)
-    before = lights
-    for _ in range(LIGHT_STEPS):
+    before, strengths = lights, strengths_of(state.lights)
+
+    def stepped(strengths: list[float] | None) -> tuple[list[DirectionalLights], Law]:
+        rig = state.lights.one_rig
+        return light_step(few, part, lights, state.law, tie, patches, rotations, rig, free_lights, of_law, strengths)
+
+    steps = LIGHT_STEPS
+    while steps:
+        steps -= 1
         before = lights
-        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, state.lights.one_rig, free_lights, of_law)
+        lights, state.law = stepped(strengths)
+        strengths = strengths and strengths_in(lights)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie, patches=patches)
+        if not steps and compare and strengths is None and free_lights and state.lights.one_rig:
+            exposed = strengths_in(stepped([1.0] * len(lights))[0])
+            # Lights that were solved as if all views were as bright are solved again.
+            strengths, steps = (None, 0) if exposed_alike(exposed) else ([1.0] * len(lights), 2 * LIGHT_STEPS)
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)
     return solved, float(np.concatenate(turned).mean())

@@ -14,11 +14,16 @@ mean slope (patches.py), which adds two multipliers each: with A_j, c, E there a
 Weights at their bound whose gradient keeps them there are no unknowns. A few thousand vertices say all there is to say about the lights,
 three unknowns each.
 
+Where views under one rig are exposed each anew (strengths.py), the logarithms of their strengths e_i are unknowns too: m of view i is e_i
+times the rig's, and so are its derivatives; by log e_i the derivative is the image.
+
 float64 holds the reduced system: S is the small difference of two large matrices along the family.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -77,19 +82,48 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
 @dataclass(frozen=True)
 class _Layout:
     """Which lights are whose: of each view the number of its rig, one for all or one for each; of each rig the number of its lights, none
-    where they are known. The unknowns are the rigs' m, x of all lights, then y, then z, and those of the law."""
+    where they are known. The unknowns are the rigs' m, x of all lights, then y, then z, the views' strengths, none where all are as bright,
+    and those of the law."""
 
     rig: list[int]
     lights: list[int]
+    strengths: int
 
     def start(self, rig: int) -> int:
-        """Place of a rig's first unknown."""
+        """Place of a rig's first unknown, or, after the last rig, of the first view's strength."""
         return 3 * sum(self.lights[:rig])
 
 
-def _layout(lights: list[DirectionalLights], one_rig: bool, free: bool) -> _Layout:
+def _layout(lights: list[DirectionalLights], one_rig: bool, free: bool, strong: bool) -> _Layout:
     sizes = [len(of_view.intensity) for of_view in lights] if free else []
-    return _Layout([0] * len(lights), sizes[:1]) if one_rig else _Layout(list(range(len(lights))), sizes)
+    of_one = _Layout([0] * len(lights), sizes[:1], len(lights) if free and strong else 0)
+    return of_one if one_rig else _Layout(list(range(len(lights))), sizes, 0)
+
+
+@dataclass(frozen=True)
+class _OfStrength:
+    """Products of the derivative by a view's strength: with those by vertices (V, p), by lights (3, lights), and with itself, those by the
+    law, and the residual (OF_LAW + 2,)."""
+
+    vertices: Tensor
+    lights: Tensor
+    rest: Tensor
+
+    @classmethod
+    def none(cls, like: Tensor, vertices: int, unknowns: int, lights: int) -> _OfStrength:
+        """Of no samples."""
+        double = torch.float64
+        return cls(like.new_zeros(vertices, unknowns), like.new_zeros(3, lights, dtype=double), like.new_zeros(OF_LAW + 2, dtype=double))
+
+    def add(self, index: Tensor, weighted: Tensor, heavy: Tensor, weight: Tensor, image: Tensor) -> None:
+        """Adds the samples of n vertices (n,), in place: weighted (n, p + OF_LAW + 1, lights) and heavy (n, 3, lights) derivatives by
+        vertices, law and lights with their weight (n, lights), and the image (n, lights)."""
+        along = (weighted * image[:, None]).sum(-1)
+        p = self.vertices.shape[1]
+        self.vertices.index_add_(0, index, along[:, :p])
+        self.lights.add_((heavy * image[:, None]).sum(0))
+        self.rest[0] += (weight * image**2).sum()
+        self.rest[1:].add_(along[:, p:].sum(0))
 
 
 @dataclass(frozen=True)
@@ -97,16 +131,19 @@ class _Sums:
     """Products of derivatives with each other, each sample divided by its vertex's residual variance.
 
     vertices (V, p + 3, p + 3): by the vertex's p unknowns and the law's two, and the residual; count (V,) weight of a vertex's samples;
-    of each rig cross (V, p, 3, lights): by vertex and light; lights (lights, 3, 6): by light with by light, the law's two, the residual.
+    of each rig cross (V, p, 3, lights): by vertex and light; lights (lights, 3, 6): by light with by light, the law's two, the residual;
+    strengths: by number of the view, where strengths are unknown.
     """
 
     vertices: Tensor
     count: Tensor
     cross: dict[int, Tensor]
     lights: dict[int, Tensor]
+    strengths: dict[int, _OfStrength]
 
     def add(self, other: _Sums) -> None:
         """Adds sums over other views, in place."""
+        self.strengths.update(other.strengths)
         self.vertices.add_(other.vertices)
         self.count.add_(other.count)
         for mine, others in ((self.cross, other.cross), (self.lights, other.lights)):
@@ -115,9 +152,16 @@ class _Sums:
 
 
 def _sums(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: list[Tensor], rigs: list[int]
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    rotations: list[Tensor],
+    rigs: list[int],
+    strengths: dict[int, float],
 ) -> _Sums:
-    """Over some views with their lights, rotations and rigs, -1 where the lights are known."""
+    """Over some views with their lights, rotations and rigs, -1 where the lights are known; strengths: by number in the capture where they
+    are unknown, in the order of the views."""
     n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
     size = {rig: len(of_view.intensity) for rig, of_view in zip(rigs, lights, strict=True) if rig >= 0}
     sums = _Sums(
@@ -125,7 +169,9 @@ def _sums(
         like.new_zeros(n),
         {rig: like.new_zeros(n, p, 3, count) for rig, count in size.items()},
         {rig: like.new_zeros(count, 3, 3 + OF_LAW + 1, dtype=torch.float64) for rig, count in size.items()},
+        {number: _OfStrength.none(like, n, p, len(of_view.intensity)) for number, of_view in zip(strengths, lights, strict=False)},
     )
+    numbers = list(strengths)
     first, second = tangents(vertices.normal)
     for batch in batches(views, lights):
         index, towards = batch.vertex, batch.towards
@@ -141,24 +187,37 @@ def _sums(
         if not size:
             continue
         of_light = light_jacobian(shaded, normal, towards, batch.lights, law, torch.stack([rotations[i] for i in batch.views]))
+        if strengths:
+            of_views = [strengths[numbers[i]] for i in batch.views]
+            of_light = of_light * torch.tensor(of_views, dtype=of_light.dtype, device=of_light.device)[:, None, None, None]
         for k, view in enumerate(batch.views):
             rig = rigs[view]
             sums.cross[rig].index_add_(0, index[k], weighted[k, :, :p, None] * of_light[k, :, None])
             # What goes with the light's own derivative carries the weight.
             heavy = (weight[k] / scale[k, :, None] ** 2)[:, None] * of_light[k]
             sums.lights[rig] += torch.einsum("pil,pjl->lij", of_light[k], torch.cat([heavy, weighted[k, :, p:]], 1))
+            if strengths:
+                own_weight = weight[k] / scale[k, :, None] ** 2
+                sums.strengths[numbers[view]].add(index[k], weighted[k], heavy, own_weight, shaded.predicted[k])
     return sums
 
 
 def _coupled(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, rotations: list[Tensor], layout: _Layout
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    rotations: list[Tensor],
+    layout: _Layout,
+    strengths: Sequence[float] | None,
 ) -> _Sums:
     """The sums over all views, dealt to the cores as `vertex_equations` deals them."""
     hands = min(WORKERS, len(views))
     rigs = layout.rig if layout.lights else [-1] * len(views)
 
     def dealt(k: int) -> _Sums:
-        return _sums(views[k::hands], vertices, lights[k::hands], law, rotations[k::hands], rigs[k::hands])
+        of_views = {} if strengths is None else {i: strengths[i] for i in range(k, len(views), hands)}
+        return _sums(views[k::hands], vertices, lights[k::hands], law, rotations[k::hands], rigs[k::hands], of_views)
 
     total, *others = on_cores(dealt, range(hands))
     for other in others:
@@ -169,7 +228,8 @@ def _coupled(
 def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
     """H_mm and g_m; the last OF_LAW of m are the law's."""
     of_law = sums.vertices[:, -OF_LAW - 1 :, -OF_LAW - 1 :].double().sum(0)
-    unknowns = 3 * sum(layout.lights) + OF_LAW
+    first = layout.start(len(layout.lights))
+    unknowns = first + layout.strengths + OF_LAW
     H, g = of_law.new_zeros(unknowns, unknowns), of_law.new_zeros(unknowns)
     law = slice(unknowns - OF_LAW, unknowns)
     H[law, law], g[law] = of_law[:-1, :-1], of_law[:-1, -1]
@@ -180,6 +240,11 @@ def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
         H[own, law] = products[:, 3:-1].transpose(1, 2).reshape(-1, OF_LAW)
         H[law, own] = H[own, law].T
         g[own] = products[:, -1].reshape(-1)
+    for view, of_strength in sums.strengths.items():
+        own, at = slice(layout.start(layout.rig[view]), layout.start(layout.rig[view] + 1)), first + view
+        H[own, at] = H[at, own] = of_strength.lights.reshape(-1)
+        H[law, at] = H[at, law] = of_strength.rest[1:-1]
+        H[at, at], g[at] = of_strength.rest[0], of_strength.rest[-1]
     return H, g
 
 
@@ -201,7 +266,9 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     """dm of the Schur complement. solved: grazing, bounce, gleam."""
     H, g = _lights_equations(sums, layout)
     moved, A = patches.moved(vertices.normal)
-    derivatives = [*(sums.cross[rig].flatten(2) for rig in range(len(layout.lights))), sums.vertices[:, : -OF_LAW - 1, -OF_LAW - 1 : -1]]
+    by_strength = [torch.stack([sums.strengths[i].vertices for i in range(layout.strengths)], 2)] if layout.strengths else []
+    by_law = sums.vertices[:, : -OF_LAW - 1, -OF_LAW - 1 : -1]
+    derivatives = [*(sums.cross[rig].flatten(2) for rig in range(len(layout.lights))), *by_strength, by_law]
     reduced = eliminated(H, g, derivatives, _blocks(sums, vertices, anchor), A, patches)
     F = reduced.F.flatten(0, 1)
     of_patches = torch.linalg.solve(reduced.E, torch.cat([reduced.F, (reduced.f - patches.summed(moved))[..., None]], 2)).flatten(0, 1)
@@ -241,24 +308,36 @@ def light_step(
     one_rig: bool,
     free_lights: bool = True,
     free: OfLaw = (True, True, True),
+    strengths: Sequence[float] | None = None,
 ) -> tuple[list[DirectionalLights], Law]:
     """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated.
 
     rotations: from the world to the frames in which the views' lights are unknown (rig_frame in camera.py), float32.
+    strengths: how many times as bright as the rig's the lights of each view are, which is unknown as well (strengths.py); all the same if
+    None.
     """
-    layout = _layout(lights, one_rig, free_lights)
-    step = _reduced_step(_coupled(views, vertices, lights, law, rotations, layout), layout, vertices, anchor, patches, free)
+    layout = _layout(lights, one_rig, free_lights, strengths is not None)
+    strengths = strengths if layout.strengths else None
+    sums = _coupled(views, vertices, lights, law, rotations, layout, strengths)
+    step = _reduced_step(sums, layout, vertices, anchor, patches, free)
     grazing, bounce, gleam = step[-OF_LAW:].tolist()
     law = _bounded(law, law.grazing + grazing, law.bounce + bounce, law.gleam + gleam, vertices)
     if not layout.lights:
         return lights, law
     stepped = []
-    for of_view, rotation, rig in zip(lights, rotations, layout.rig, strict=True):
+    first = layout.start(len(layout.lights))
+    brighter = step[first : first + layout.strengths].tolist()
+    for i, (of_view, rotation, rig) in enumerate(zip(lights, rotations, layout.rig, strict=True)):
         m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T
         d = step[layout.start(rig) :][: m.numel()].reshape(3, -1).T
+        if strengths is not None:
+            d = strengths[i] * d
         length = m.norm(dim=1, keepdim=True)
         d = d * (LARGEST_TURN * length / d.norm(dim=1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
         m = m + d
+        if strengths is not None:
+            # What is common to all views is the lights' scale.
+            m = m * math.exp(brighter[i] - sum(brighter) / len(brighter))
         intensity = m.norm(dim=1)
         stepped.append(DirectionalLights((m / intensity[:, None] @ rotation.double()).float(), intensity.float()))
     return stepped, law

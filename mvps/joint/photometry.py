@@ -27,6 +27,7 @@ from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.state import State, grey_albedo, lit_by, material_of, relative_residuals, senders_of
 from mvps.joint.steps import free_reflectance, lambert_albedo, possible, vertex_step, vertex_steps, with_population
 from mvps.joint.thinned import thinned
+from mvps.material import POOR_FIT
 from mvps.mesh import angles_deg, vertex_normals
 from mvps.scene import Capture, CaptureError, Lights, Surface
 
@@ -128,7 +129,9 @@ def photometric_round(
         few = relit(vertices)
         vertices, unknown = with_bounce(state, vertices, lights, free)
     tie = replace(free, sigma=LIGHT_TIE)
-    solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown)
+    # On a hull, and where the model fits badly, what is wrong with them looks like views that are not as bright.
+    compare = carried is not None and not task.choose and float(relative_residuals(state.views, vertices).nanmedian()) <= POOR_FIT
+    solved, light_step = solved_lights(state, capture, few, vertices, tie, patches, task.free_lights, unknown, compare)
     moved, state.lights = _light_change(state.lights, solved), solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
     vertices = vertex_step(state.views, vertices, lights, state.law, free, stated=False)

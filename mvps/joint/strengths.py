@@ -1,0 +1,40 @@
+"""How bright the photographs of each view are, of views under one rig: cameras that expose every view anew, flashes that fade.
+
+The photographs of view i are e_i times as bright as the rig's lamps make them: its lights' intensities are e_i times the rig's. log e are
+unknowns of the lights' block (lights.py), with the image itself as derivative; what all views have in common is the lights' scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mvps.joint.blocks import DirectionalLights
+from mvps.scene import Lights
+
+ROUNDING = 1e-4
+"""Relative difference of views' brightness that is rounding: directions are turned into every view's frame in single precision."""
+
+ALIKE = 0.03
+"""Step of log e up to which views are exposed alike (docs/findings/lights.md has what it is where they are)."""
+
+
+def strengths_of(lights: Lights) -> list[float] | None:
+    """e of views under one rig, their mean 1; None where all are as bright, and without a rig."""
+    sums = np.array([of_view.sum() for of_view in lights.intensity])
+    relative = sums / sums.mean()
+    return relative.tolist() if lights.one_rig and np.abs(relative - 1).max() >= ROUNDING else None
+
+
+def strengths_in(lights: Sequence[DirectionalLights]) -> list[float]:
+    """e of the views' lights, all of one rig, their mean 1."""
+    sums = np.array([float(of_view.intensity.double().sum()) for of_view in lights])
+    relative: list[float] = (sums / sums.mean()).tolist()
+    return relative
+
+
+def exposed_alike(strengths: Sequence[float]) -> bool:
+    """Whether views are as bright as far as surfaces and models that are not exact can tell."""
+    step = np.log(strengths)
+    return bool(np.abs(step - step.mean()).max() <= ALIKE)
