@@ -64,17 +64,17 @@ def solved_lights(
     patches: Patches,
     free_lights: bool,
     of_law: OfLaw,
-    compare: bool,
+    alike: float | None,
 ) -> tuple[Lights, float]:
     """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
-    compare: look whether views under one rig are exposed alike; where they are not, how bright each is is solved as well.
+    alike: bound of `exposed_alike`; where views under one rig are not, how bright each is is solved as well. None: not to look for it.
 
     Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
     """
     pixel = surface_pixel(capture, state.surface)
     single = of_one_normal(state.surface, vertices.normal, pixel, max(state.law.sharpness, default=1.0))
     few = [replace(samples, weight=samples.weight * single[samples.vertex]) for samples in few]
-    few, part, tie = subset(few, vertices, anchor, patches.vertex)
+    few, part, tie = subset(few, vertices, replace(anchor, sigma=LIGHT_TIE), patches.vertex)
     rotations = [tensor32(rig_frame(state.lights, view.camera), patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)
     before, strengths = lights, strengths_of(state.lights)
@@ -92,10 +92,10 @@ def solved_lights(
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie, patches=patches)
-        if not steps and compare and strengths is None and free_lights and state.lights.one_rig:
+        if not steps and alike is not None and strengths is None and free_lights and state.lights.one_rig:
             exposed = strengths_in(stepped([1.0] * len(lights))[0])
             # Lights that were solved as if all views were as bright are solved again.
-            strengths, steps = (None, 0) if exposed_alike(exposed) else ([1.0] * len(lights), 2 * LIGHT_STEPS)
+            strengths, steps = (None, 0) if exposed_alike(exposed, alike) else ([1.0] * len(lights), 2 * LIGHT_STEPS)
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)
     return solved, float(np.concatenate(turned).mean())
