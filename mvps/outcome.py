@@ -126,7 +126,7 @@ def told(
             findings = [*findings, Finding("lights", "all views", f"{said} ({near.slope:.3f}, far lights 0)", False)]
             text = f"{text} But {said}."
         strengths = strengths_of(refined.lights)
-        if strengths:
+        if strengths and not settings.get("calibrated_lights"):
             said = f"photographs are, view by view, {min(strengths):.2f} to {max(strengths):.2f} times as bright as one rig makes them:"
             said += " exposures that differ, which were solved; intensities of the lights hold them"
             findings = [*findings, Finding("lights", "all views", said, True)]
