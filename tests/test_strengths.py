@@ -10,14 +10,19 @@ import torch
 from references import in_patches
 from sphere_scene import SphereScene, make_sphere
 
-from mvps.joint.blocks import DirectionalLights, Vertices
+from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
 from mvps.joint.grey import coloured_lights, grey_lights
 from mvps.joint.lights import light_step, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe
 from mvps.joint.steps import free_reflectance, vertex_step
 from mvps.joint.strengths import exposed_alike, strengths_in, strengths_of
+from mvps.mesh import angles_deg
 from mvps.outcome import all_lights
-from mvps.scene import Lights
+from mvps.progress import Progress
+from mvps.reconstruct import Settings, reconstruct
+from mvps.scene import Capture, Lights
+from mvps.synthetic.scene import make_scene, render_capture
+from mvps.synthetic.settings import SceneSettings
 
 CPU = torch.device("cpu")
 EXPOSURE = np.array([0.7, 1.3, 1.0, 0.8, 1.5, 0.9])
@@ -47,8 +52,6 @@ def problem(scene: SphereScene, exposure: np.ndarray) -> tuple[list[ViewSamples]
 
 def images(scene: SphereScene, rig: Lights, vertices: Vertices) -> list[torch.Tensor]:
     """What the model says of all samples of the rig's views."""
-    from mvps.joint.blocks import evaluate
-
     r = scene.reconstruction
     views = observe(scene.capture, r.surface, rig, CPU)
     return [
@@ -105,3 +108,21 @@ def test_a_view_that_was_kept_back_is_as_bright_as_the_rig(scene: SphereScene) -
     complete = all_lights(capture, used, held, of_used, scene.reconstruction.surface, scene.reconstruction.material, CPU)
     np.testing.assert_allclose(complete.direction[-1], direction[-1], atol=1e-9)
     np.testing.assert_allclose(complete.intensity[-1], lights.intensity[0] / EXPOSURE.mean() * EXPOSURE[:-1].mean(), rtol=1e-6)
+
+
+def test_exposures_of_a_capture_are_found_and_said() -> None:
+    settings = SceneSettings(views=8, lights=8, size=96)
+    made = make_scene(settings)
+    capture = render_capture(settings, made)[0]
+    exposure = np.exp(np.random.default_rng(0).normal(0, 0.7, 8))
+    factors = (exposure / exposure.max()).tolist()
+    views = (
+        replace(view, samples=np.rint(view.samples * factor).astype(np.uint16)) for view, factor in zip(capture.views, factors, strict=True)
+    )
+    found = reconstruct(Capture("made", tuple(views)), Settings("made", preset="draft"), None, Progress())
+    turned = [angles_deg(a, b) for a, b in zip(found.lights.direction, made.lights.direction, strict=True)]
+    # Solved as if all views were as bright they are 17 deg off.
+    assert np.concatenate(turned).mean() < 0.5
+    np.testing.assert_allclose(strengths_of(found.lights), exposure / exposure.mean(), rtol=0.03)
+    (finding,) = found.metrics["findings"]
+    assert finding["about"] == "lights" and finding["mended"] and "exposures" in finding["text"]
