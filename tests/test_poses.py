@@ -137,8 +137,8 @@ def test_what_cameras_do_each_on_its_own_is_not_the_principal_point(clean: Captu
     assert pointed(clean) == (clean, [])
 
 
-def test_a_shift_along_the_axis_of_a_ring_is_in_doubt(clean: Capture) -> None:
-    """Cameras at one height all around: the world may have moved along the axis as well as the principal point."""
+def test_what_cameras_on_one_ring_do_not_tell_is_in_doubt(clean: Capture) -> None:
+    """Cameras at one height all around: along the ring's axis the world may have moved as well as the principal point."""
     ring = Capture("ring", tuple(view for k, view in enumerate(clean.views) if k % 2 == 0))
     _, findings = pointed(shifted(ring, (3.0, 0.0)))
     assert [(one.about, one.mended) for one in findings] == [("pose", True), ("pose", False)]

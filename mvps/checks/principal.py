@@ -72,7 +72,8 @@ def _directions(outlines: Outlines, found: list[Coherence]) -> Float:
 def _fitted(outlines: Outlines, axes: Float, tie: float) -> list[Float]:
     """Shifts along the first of the axes and along both, the second begun where the first ends: far from there misses say nothing of what
     is across."""
-    along = fitted(outlines, Shared(axes[:1]), np.zeros(1), tie, np.inf)
+    first = Shared(axes[:1])
+    along = fitted(outlines, first, first.zero(outlines.cameras), tie, np.inf)
     return [along, fitted(outlines, Shared(axes), np.append(along, 0.0), tie, np.inf)]
 
 

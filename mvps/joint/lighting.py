@@ -94,7 +94,7 @@ def solved_lights(
             part = vertex_step(few, part, lights, state.law, tie, patches=patches)
         if not steps and alike is not None and strengths is None and free_lights and state.lights.one_rig:
             exposed = strengths_in(stepped([1.0] * len(lights))[0])
-            # Lights that were solved as if all views were as bright are solved again.
+            # Lights that were solved as if all views were as bright are solved again, from farther off than a round's steps begin.
             strengths, steps = (None, 0) if exposed_alike(exposed, alike) else ([1.0] * len(lights), 2 * LIGHT_STEPS)
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)

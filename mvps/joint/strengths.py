@@ -23,15 +23,17 @@ ALIKE, ROUGHLY_ALIKE = 0.03, 0.5
 
 def strengths_of(lights: Lights) -> list[float] | None:
     """e of views under one rig, their mean 1; None where all are as bright, and without a rig."""
-    sums = np.array([of_view.sum() for of_view in lights.intensity])
-    relative = sums / sums.mean()
-    return relative.tolist() if lights.one_rig and np.abs(relative - 1).max() >= ROUNDING else None
+    found = _relative([of_view.sum() for of_view in lights.intensity])
+    return found if lights.one_rig and max(abs(e - 1) for e in found) >= ROUNDING else None
 
 
 def strengths_in(lights: Sequence[DirectionalLights]) -> list[float]:
     """e of the views' lights, all of one rig, their mean 1."""
-    sums = np.array([float(of_view.intensity.double().sum()) for of_view in lights])
-    relative: list[float] = (sums / sums.mean()).tolist()
+    return _relative([float(of_view.intensity.double().sum()) for of_view in lights])
+
+
+def _relative(sums: Sequence[float]) -> list[float]:
+    relative: list[float] = (np.array(sums) / np.mean(sums)).tolist()
     return relative
 
 
