@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from mvps.checks import ambient as checks
 from mvps.checks.ambient import ambient, ambient_share
 from mvps.checks.radiometry import is_metal
 from mvps.scene import Capture, View
@@ -19,6 +20,7 @@ from mvps.synthetic.settings import SceneSettings
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 
+from hard.cases import by_chance
 from hard.scenes import made_of, rendered, shaped_as, surface_of
 
 
@@ -57,6 +59,31 @@ def test_it_is_found_and_most_of_it_taken_off(share: float) -> None:
         off, was = (np.abs(v.samples / scale - before.samples)[lit_].mean() for v in (mended, harmed))
         assert off < 0.6 * was
     assert ambient_share(after) < 0.3 * ambient_share(given)
+
+
+def parts(before: Capture, after: Capture) -> np.ndarray:
+    """(views,) by what part the second capture is darker."""
+    return np.array([1 - b.samples.sum(dtype=float) / a.samples.sum(dtype=float) for a, b in zip(before.views, after.views, strict=True)])
+
+
+@pytest.mark.parametrize(("case", "turned", "tolerance"), [(4, [3, 4, 5], 0.01), (92, [6], 0.07)])
+def test_views_whose_factors_come_out_turned_are_told_by_others(case: int, turned: list[int], tolerance: float) -> None:
+    """By their own half of such views would be taken off."""
+    sample, _ = by_chance(case)
+    views = sample.given.views
+    assert [k for k, view in enumerate(views) if not checks._agreed(checks._factors(view, checks._some(view)))] == turned
+    after, _ = ambient(sample.given)
+    np.testing.assert_allclose(parts(sample.given, after), parts(sample.given, sample.good), atol=tolerance)
+
+
+def test_a_view_that_no_factors_tell_has_as_much_as_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    given = with_ambient(clean(), 0.2)
+    found = parts(given, ambient(given)[0])
+    told = checks._told(given.views)
+    monkeypatch.setattr(checks, "_told", lambda views: [None, *told[1:]])
+    without = parts(given, ambient(given)[0])
+    np.testing.assert_array_equal(without[1:], found[1:])
+    assert without[0] == pytest.approx(found[0], rel=0.2)
 
 
 def test_what_is_no_data_stays_so() -> None:

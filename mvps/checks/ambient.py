@@ -15,12 +15,18 @@ These differ from lamp to lamp, where ambient light is the same under all: among
 
 is no more than SAME, in the median of the pixels.
 
+Factors of pixels that hardly share lights may come out with a part of them turned round: what is then predicted to be in shadow is lit.
+Such a view says nothing, and is told by the factors of a view that it agrees with, as views under one rig do, since factors leave
+a linear map open; or by none.
+
 Taken off: c_p over the bright level as a linear function of b_p / |b_p|, per channel, fitted to the medians of the pixels' shadowed
-samples. Ambient light from everywhere falls on a surface smoothly by its direction; what concavities keep out is not modelled.
+samples. Ambient light from everywhere falls on a surface smoothly by its direction; what concavities keep out is not modelled. Of a view
+that no factors tell it is what the others have, in the median.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,6 +59,9 @@ LEAST = 0.01
 
 FEWEST_SHADOWS, FEWEST_OF_LIGHT, FEWEST_OF_PIXEL = 50, 10, 3
 """Shadowed samples of a view, of a light and of a pixel, below which they say nothing."""
+
+CONTRADICTED = 0.3
+"""Part of the shadowed samples that may be lit: 0 to 0.15 where factors are right, 0.45 to 0.86 where turned (docs/findings/checks.md)."""
 
 SAME = 0.2
 """Largest q of ambient light: up to 0.22 at a hundredth of the bright level, 0.23 to 0.6 on most metals (docs/findings/checks.md)."""
@@ -87,10 +96,31 @@ def _factors(view: View, chosen: NDArray[np.int64], s: Float | None = None) -> _
     return _Factors(b, bright, s, level, (b @ s.T < -SHADOWED * level) & view.shown, image)
 
 
-def _line(view: View) -> tuple[float, float, float]:
+def _some(view: View) -> NDArray[np.int64]:
+    """Pixels by chance, in order."""
+    return np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
+
+
+def _agreed(f: _Factors) -> bool:
+    """Whether what is predicted to be in shadow is dark."""
+    lit = f.shadowed & (f.image > LIT * f.bright)
+    return bool(lit.sum() <= CONTRADICTED * f.shadowed.sum())
+
+
+def _told(views: Sequence[View]) -> list[_Factors | None]:
+    """Factors of some pixels of every view, its own or by another's lights; None where none agrees with its photographs."""
+    own = on_cores(lambda view: _factors(view, _some(view)), views)
+    right = [f if _agreed(f) else None for f in own]
+
+    def by_others(k: int) -> _Factors | None:
+        others = (f.s for f, view in zip(right, views, strict=True) if f is not None and view.lights == views[k].lights)
+        return next((f for f in (_factors(views[k], _some(views[k]), s) for s in others) if _agreed(f)), None)
+
+    return [by_others(k) if f is None else f for k, f in enumerate(right)]
+
+
+def _line(f: _Factors) -> tuple[float, float, float]:
     """a, k times the mean level, and q; NaN where shadows are too few."""
-    chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
-    f = _factors(view, chosen)
     count, several = f.shadowed.sum(0), f.shadowed.sum(1) >= FEWEST_OF_PIXEL
     enough = count >= FEWEST_OF_LIGHT
     if count.sum() < FEWEST_SHADOWS or enough.sum() < 3 or not several.any():
@@ -109,8 +139,17 @@ def _line(view: View) -> tuple[float, float, float]:
 
 def ambient_share(capture: Capture) -> float:
     """a of the module's docstring; 0 where it is not to be believed or cannot be told."""
-    enough = [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
-    lines = np.array(on_cores(_line, enough)).reshape(-1, 3)
+    return _share(_told(_enough(capture)))
+
+
+def _enough(capture: Capture) -> list[View]:
+    """Views of enough lights."""
+    return [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
+
+
+def _share(factors: Sequence[_Factors | None]) -> float:
+    nothing = (float("nan"),) * 3
+    lines = np.array([nothing if f is None else _line(f) for f in factors]).reshape(-1, 3)
     told = np.isfinite(lines[:, 0])
     if not told.any() or told.mean() < 0.5:
         return 0.0
@@ -118,19 +157,31 @@ def ambient_share(capture: Capture) -> float:
     return float(a) if a > LEAST and a > 2 * abs(k) and q <= SAME else 0.0
 
 
-def _taken_off(view: View) -> View:
-    """The view without its ambient image."""
-    some = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
-    f = _factors(view, np.arange(len(view.pixels)), _factors(view, some).s)
+def _bright(view: View, channel: int) -> Float:
+    """(n,) bright level of a channel's pixels, code values."""
+    bright: Float = np.maximum(np.quantile(view.samples[..., channel][:, view.shown].astype(np.float32), 0.8, axis=1), 1)
+    return bright
+
+
+def _by_direction(view: View, s: Float) -> Float:
+    """(3, n) ambient light of the pixels over their bright level, by channel. s: of lights that agree with the view."""
+    f = _factors(view, np.arange(len(view.pixels)), s)
     towards = np.column_stack([np.ones(len(f.b)), f.b / np.maximum(np.linalg.norm(f.b, axis=1, keepdims=True), 1e-12)])
-    values = view.samples.astype(np.float32)
     dark = np.flatnonzero(f.shadowed.any(1))
+    found = []
     for channel in range(3):
-        of_channel = values[..., channel]
-        bright = np.maximum(np.quantile(of_channel[:, view.shown], 0.8, axis=1), 1)
-        seen = np.nanmedian(np.where(f.shadowed[dark], of_channel[dark], np.nan), axis=1) / bright[dark]
+        of_dark = np.where(f.shadowed[dark], view.samples[dark, :, channel].astype(np.float32), np.nan)
+        seen = np.nanmedian(of_dark, axis=1) / _bright(view, channel)[dark]
         line = np.linalg.lstsq(towards[dark], seen, rcond=None)[0]
-        of_channel -= (np.maximum(towards @ line, 0) * bright)[:, None].astype(np.float32)
+        found.append(np.maximum(towards @ line, 0))
+    return np.array(found)
+
+
+def _taken_off(view: View, of_bright: Float) -> View:
+    """The view without its ambient image, of_bright (3, n) or (3, 1) times the bright levels."""
+    values = view.samples.astype(np.float32)
+    for channel in range(3):
+        values[..., channel] -= (of_bright[channel] * _bright(view, channel))[:, None].astype(np.float32)
     less = np.rint(np.maximum(values, 0)).astype(np.uint16)
     # What is no data stays so.
     return replace(view, samples=np.where(view.usable()[..., None], less, view.samples))
@@ -138,10 +189,16 @@ def _taken_off(view: View) -> View:
 
 def ambient(capture: Capture) -> tuple[Capture, list[Finding]]:
     """The capture without ambient light, where there is some."""
-    share = ambient_share(capture)
+    enough = _enough(capture)
+    factors = _told(enough)
+    share = _share(factors)
     if not share or is_metal(capture):
         return capture, []
-    views = tuple(_taken_off(view) if view.shown.sum() >= FEWEST_LIGHTS else view for view in capture.views)
+    told = [(view, f) for view, f in zip(enough, factors, strict=True) if f is not None]
+    of_bright = dict(zip((view.name for view, _ in told), on_cores(lambda one: _by_direction(one[0], one[1].s), told), strict=True))
+    usual = np.median([np.median(of_view, axis=1) for of_view in of_bright.values()], axis=0)[:, None]
+    taken = {view.name: _taken_off(view, of_bright.get(view.name, usual)) for view in enough}
+    views = tuple(taken.get(view.name, view) for view in capture.views)
     text = (
         f"where no lamp shines photographs are {100 * share:.1f} % as bright as where it does, whatever the lamp: there was ambient light;"
         " what every photograph has of it was taken off"
