@@ -85,10 +85,11 @@ def keep_below(gigabytes: float, program: float, sizes: Sequence[tuple[int, int]
     room_for(likely_vertices(sizes, preset))
 
 
-def solved_together(lights: Lights) -> int:
-    """How many lights one system of equations has: those of the rig, or of all views where they are not one rig's."""
+def solved_together(lights: Lights, strengths: int) -> int:
+    """How many lights one system of equations has: those of the rig, or of all views where they are not one rig's. strengths: how many
+    photographs' are unknowns beside them (joint/strengths.py), three of which are as many as a light's."""
     of_views = [len(intensity) for intensity in lights.intensity]
-    return max(of_views) if lights.one_rig else sum(of_views)
+    return (max(of_views) if lights.one_rig else sum(of_views)) + -(-strengths // 3)
 
 
 def room_for(vertices: float, sending: int = 0, lights: int = 0) -> None:

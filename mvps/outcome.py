@@ -26,15 +26,15 @@ def all_lights(
     from mvps.joint.held_out import carried_over, fit_lights
     from mvps.joint.strengths import strengths_of
 
-    strengths = strengths_of(lights)
+    strengths = strengths_of(lights) if len({view.lights for view in used.views}) == 1 else None
     known: dict[tuple[str, int], tuple[Any, Any]] = {}
     for view, directions, intensities in zip(used.views, lights.direction, lights.intensity, strict=True):
         known.update({(view.name, n): pair for n, pair in zip(view.lights, zip(directions, intensities, strict=True), strict=True)})
     if held is not None and lights.one_rig:
         for view in held.views:
             directions, intensities = carried_over(lights, used.views[0].camera, view.camera)
-            # How bright a view is that was not used, nothing says.
-            intensities = intensities / (strengths[0] if strengths else 1.0)
+            # How bright photographs are that were not used, nothing says.
+            intensities = intensities if strengths is None else intensities / strengths[0][:, None]
             rig = dict(zip(used.views[0].lights, zip(directions, intensities, strict=True), strict=True))
             known.update({(view.name, n): rig[n] for n in view.lights if n in rig})
     if held is not None:
@@ -107,7 +107,7 @@ def told(
     used: what it was made from; settings: plain values; complete, pictures: lights and normals of all views, of those used their pixels'
     own, which the verdict compares and the result draws to the surface; findings: of the capture's checks; words: to end the verdict with.
     """
-    from mvps.joint.strengths import strengths_of
+    from mvps.joint.strengths import strengths_of, unknown_in
     from mvps.measures import held_out_photographs, held_out_views, photograph_errors
     from mvps.nearness import nearness
     from mvps.verdict import signs, verdict
@@ -126,9 +126,12 @@ def told(
             findings = [*findings, Finding("lights", "all views", f"{said} ({near.slope:.3f}, far lights 0)", False)]
             text = f"{text} But {said}."
         strengths = strengths_of(refined.lights)
-        if strengths and not settings.get("calibrated_lights"):
-            said = f"photographs are, view by view, {min(strengths):.2f} to {max(strengths):.2f} times as bright as one rig makes them:"
-            said += " exposures that differ, which were solved; intensities of the lights hold them"
+        if strengths is not None and not settings.get("calibrated_lights"):
+            by_view = unknown_in(strengths) == 1
+            least, most = strengths.min(), strengths.max()
+            said = f"photographs are{', view by view,' if by_view else ''} {least:.2f} to {most:.2f} times as bright as one rig makes them:"
+            said += f" exposures that differ{'' if by_view else ', or lamps that flicker'}, which were solved; intensities of the lights"
+            said += " hold them"
             findings = [*findings, Finding("lights", "all views", said, True)]
         drawn = dict(zip((view.name for view in used.views), drawn_to_surface(used, refined.surface, of_used), strict=True))
         stage.status(status)

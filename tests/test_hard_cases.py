@@ -76,6 +76,14 @@ def test_exposures_differ_from_view_to_view_and_clip_nothing(made: tuple[Capture
         np.testing.assert_allclose(b.samples, factor * g.samples.astype(float), atol=1)
 
 
+def test_flicker_differs_from_photograph_to_photograph_and_clips_nothing(made: tuple[Capture, Truth]) -> None:
+    good, bad = (capture.views for capture in (made[0], damage.flickering(made[0], 0.1, rng())))
+    level = np.array([b.samples.sum((0, 2)) / g.samples.sum((0, 2)) for g, b in zip(good, bad, strict=True)])
+    assert level.max() == pytest.approx(1, abs=1e-3) and np.log(level).std(1).min() > 0.02 and np.log(level).std(0).min() > 0.01
+    for g, b, factors in zip(good, bad, level, strict=True):
+        np.testing.assert_allclose(b.samples, factors[:, None] * g.samples.astype(float), atol=1)
+
+
 def test_gamma_is_undone_by_its_power(made: tuple[Capture, Truth]) -> None:
     harmed = damage.gamma(made[0], 2.2, rng())
     assert np.abs(harmed.views[1].radiance() ** 2.2 - made[0].views[1].radiance()).max() < 1e-4

@@ -91,7 +91,7 @@ def test_lights_of_their_own_take_room() -> None:
 def test_lights_of_one_rig_are_the_same_in_all_views(one_rig: bool, together: int) -> None:
     towards = np.array([[0.0, 0.0, 1.0]])
     lights = Lights(tuple(towards.repeat(n, 0) for n in (3, 2)), tuple(np.ones((n, 3)) for n in (3, 2)), one_rig)
-    assert solved_together(lights) == together
+    assert solved_together(lights, 0) == together and solved_together(lights, 4) == together + 2
 
 
 def test_light_by_way_of_lobes_takes_room() -> None:

@@ -1,8 +1,8 @@
-"""Views under one rig whose exposures differ: how bright each is comes out with the lights, and nothing does where they are alike."""
+"""Photographs under one rig whose exposures differ: how bright each is comes out with the lights, and nothing does where they are alike."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -12,10 +12,10 @@ from sphere_scene import SphereScene, make_sphere
 
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate
 from mvps.joint.grey import coloured_lights, grey_lights
-from mvps.joint.lights import light_step, with_mean_one
+from mvps.joint.lights import light_step, told_of_strengths, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe
 from mvps.joint.steps import free_reflectance, vertex_step
-from mvps.joint.strengths import exposed_alike, strengths_in, strengths_of
+from mvps.joint.strengths import MUCH, SOME, Strengths, Told, as_bright, needed, strengths_in, strengths_of, unknown_in, unknown_of
 from mvps.mesh import angles_deg
 from mvps.outcome import all_lights
 from mvps.progress import Progress
@@ -26,6 +26,7 @@ from mvps.synthetic.settings import SceneSettings
 
 CPU = torch.device("cpu")
 EXPOSURE = np.array([0.7, 1.3, 1.0, 0.8, 1.5, 0.9])
+FLICKER = np.exp(np.random.default_rng(3).normal(0, 0.05, (6, 10)))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,8 @@ def scene() -> SphereScene:
 
 
 def problem(scene: SphereScene, exposure: np.ndarray) -> tuple[list[ViewSamples], Vertices, list[DirectionalLights], list[torch.Tensor]]:
-    """Samples of views that are so many times as bright, true vertices, the lights of one rig, and the views' rotations."""
+    """Samples of photographs that are so many (views,) or (views, lights) times as bright, true vertices, the lights of one rig, and the
+    views' rotations."""
     r = scene.reconstruction
     direction, intensity = r.lights.direction[0] @ scene.capture.views[0].camera.rotation.T, r.lights.intensity[0]
     rotations = [view.camera.rotation for view in scene.capture.views]
@@ -44,7 +46,7 @@ def problem(scene: SphereScene, exposure: np.ndarray) -> tuple[list[ViewSamples]
     vertices = Vertices(normal, reflectance, torch.full((len(values),), 0.01))
     lights = grey_lights(rig, CPU)
     views = [
-        replace(samples, image=predicted * float(e))
+        replace(samples, image=predicted * torch.as_tensor(e, dtype=torch.float32))
         for samples, predicted, e in zip(observe(scene.capture, r.surface, rig, CPU), images(scene, rig, vertices), exposure, strict=True)
     ]
     return views, vertices, lights, [torch.tensor(rotation, dtype=torch.float32) for rotation in rotations]
@@ -60,40 +62,94 @@ def images(scene: SphereScene, rig: Lights, vertices: Vertices) -> list[torch.Te
     ]
 
 
-@pytest.mark.parametrize("exposure", [EXPOSURE, np.ones(6)], ids=["different", "alike"])
-def test_brightness_of_views_comes_out_with_lights_and_vertices(scene: SphereScene, exposure: np.ndarray) -> None:
+@dataclass
+class Solved:
+    """What steps of lights and vertices came to, and what strengths would be told there."""
+
+    lights: list[DirectionalLights]
+    truth: list[DirectionalLights]
+    rotations: list[torch.Tensor]
+    strengths: Strengths | None
+    told: Told
+
+
+def solved(scene: SphereScene, exposure: np.ndarray, unknown: int) -> Solved:
+    """Steps from the truth but for the photographs' brightness, which is unknown or taken for alike (unknown 0)."""
     views, vertices, truth, rotations = problem(scene, exposure)
     law, surface = scene.reconstruction.material.law, scene.reconstruction.surface
     views, vertices, anchor, patches = in_patches(surface, views, vertices, free_reflectance(vertices.normal, 0.3, 3))
-    lights, found = truth, [1.0] * 6
+    lights, found = truth, replace(as_bright(truth), unknown=unknown) if unknown else None
     for _ in range(10):
         lights, law = light_step(views, vertices, lights, law, anchor, patches, rotations, True, strengths=found)
-        found = strengths_in(lights)
+        found = found and strengths_in(lights, unknown)
         lights, vertices = with_mean_one(lights, vertices)
         for _ in range(2):
             vertices = vertex_step(views, vertices, lights, law, anchor, patches=patches)
-    strengths = np.array(found)
-    np.testing.assert_allclose(strengths, exposure / exposure.mean(), rtol=0.01)
-    assert exposed_alike(found) == (exposure is not EXPOSURE)
-    cosine = np.concatenate([(a.direction * b.direction).sum(1).numpy() for a, b in zip(lights, truth, strict=True)])
+    free = (True, True, True)
+    told = told_of_strengths(views, vertices, lights, law, anchor, patches, rotations, free, found or as_bright(lights))
+    return Solved(lights, truth, rotations, found, told)
+
+
+@pytest.mark.parametrize(
+    ("exposure", "unknown"), [(EXPOSURE, 1), (np.ones(6), 1), (EXPOSURE[:, None] * FLICKER, 10)], ids=["views", "alike", "photographs"]
+)
+def test_brightness_of_photographs_comes_out_with_lights_and_vertices(scene: SphereScene, exposure: np.ndarray, unknown: int) -> None:
+    found = solved(scene, exposure, unknown)
+    assert found.strengths is not None
+    strengths = np.array([e.numpy() for e in found.strengths.of])
+    true = np.broadcast_to(exposure.reshape(6, -1), (6, 10))
+    np.testing.assert_allclose(strengths, true / true.mean(0), rtol=0.01)
+    assert needed(found.told, 10, SOME) <= unknown
+    cosine = np.concatenate([(a.direction * b.direction).sum(1).numpy() for a, b in zip(found.lights, found.truth, strict=True)])
     assert np.degrees(np.arccos(cosine.clip(max=1))).mean() < 0.5
-    # One rig: the same directions and, but for the views' brightness, intensities in the cameras' frames.
+    # One rig: the same directions and, but for the photographs' brightness, intensities in the cameras' frames.
     products = [
-        (one.direction @ rotation.T * one.intensity[:, None]).numpy() / e
-        for one, rotation, e in zip(lights, rotations, strengths, strict=True)
+        (one.direction @ rotation.T * (one.intensity / e)[:, None]).numpy()
+        for one, rotation, e in zip(found.lights, found.rotations, found.strengths.of, strict=True)
     ]
     np.testing.assert_allclose(products, np.broadcast_to(products[0], np.shape(products)), atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("exposure", "wanted"),
+    [(np.ones(6), 0), (EXPOSURE, 1), (FLICKER, 10), (EXPOSURE[:, None] * FLICKER**0.2, 1)],
+    ids=["alike", "views", "photographs", "both"],
+)
+def test_what_is_unknown_is_told_from_lights_that_were_solved_without_it(scene: SphereScene, exposure: np.ndarray, wanted: int) -> None:
+    told = solved(scene, exposure, 0).told
+    assert needed(told, 10, MUCH) == wanted
+    # Views first, then what photographs differ by besides.
+    if wanted == 1:
+        of_views = solved(scene, exposure, 1).told
+        assert needed(of_views, 10, MUCH) == (10 if np.ndim(exposure) == 2 else 0)
+
+
+def test_what_strengths_need_to_explain() -> None:
+    apart, alike = [0.2, -0.1, -0.1], [0.01, 0.0, -0.01]
+    assert needed(Told(apart, 0.0, 0.05, 0.0), 4, SOME) == 1 and needed(Told(apart, 0.0, 0.05, 0.0), 4, MUCH) == 0
+    assert needed(Told(alike, 0.0, 0.5, 0.2), 4, MUCH) == 0 and needed(Told(alike, 0.0, 0.0, 0.3), 4, MUCH) == 4
+    # Lights that have not settled look like photographs that differ; with one light a view's strength is its photograph's.
+    assert needed(Told(alike, 0.6, 0.0, 0.5), 4, MUCH) == 0 and needed(Told(alike, 0.0, 0.0, 0.5), 1, MUCH) == 0
 
 
 def test_strengths_are_told_from_the_lights_of_a_rig(scene: SphereScene) -> None:
     lights = scene.reconstruction.lights
     rig = Lights(lights.direction, (lights.intensity[0],) * 6, True)
-    assert strengths_of(rig) is None
+    assert strengths_of(rig) is None and unknown_of(rig) == 0
     brighter = replace(rig, intensity=tuple(e * rig.intensity[0] for e in EXPOSURE))
-    np.testing.assert_allclose(strengths_of(brighter), EXPOSURE / EXPOSURE.mean())
+    of_views = np.broadcast_to((EXPOSURE / EXPOSURE.mean())[:, None], FLICKER.shape)
+    np.testing.assert_allclose(strengths_of(brighter), of_views)
+    assert unknown_in(of_views) == 1 and unknown_of(brighter) == 6
     assert strengths_of(replace(brighter, one_rig=False)) is None
     again = coloured_lights(grey_lights(brighter, CPU), [channel_ratio(e) for e in brighter.intensity], brighter)
-    np.testing.assert_allclose(strengths_of(again), EXPOSURE / EXPOSURE.mean(), rtol=1e-6)
+    np.testing.assert_allclose(strengths_of(again), of_views, rtol=1e-6)
+    assert unknown_of(again) == 6
+    flickers = replace(rig, intensity=tuple(e[:, None] * rig.intensity[0] for e in FLICKER))
+    np.testing.assert_allclose(strengths_of(flickers), FLICKER / FLICKER.mean(0))
+    assert unknown_of(flickers) == FLICKER.size
+    few = (rig.direction[0][:3], *rig.direction[1:])
+    others = replace(flickers, direction=few, intensity=(rig.intensity[0][:3], *flickers.intensity[1:]))
+    assert strengths_of(others) is None and unknown_of(others) == 0
 
 
 def test_a_view_that_was_kept_back_is_as_bright_as_the_rig(scene: SphereScene) -> None:
@@ -110,19 +166,23 @@ def test_a_view_that_was_kept_back_is_as_bright_as_the_rig(scene: SphereScene) -
     np.testing.assert_allclose(complete.intensity[-1], lights.intensity[0] / EXPOSURE.mean() * EXPOSURE[:-1].mean(), rtol=1e-6)
 
 
-def test_exposures_of_a_capture_are_found_and_said() -> None:
+@pytest.mark.parametrize(
+    ("lights", "spread", "words"), [(1, 0.7, "view by view"), (8, 0.1, "lamps that flicker")], ids=["views", "photographs"]
+)
+def test_exposures_of_a_capture_are_found_and_said(lights: int, spread: float, words: str) -> None:
     settings = SceneSettings(views=8, lights=8, size=96)
     made = make_scene(settings)
     capture = render_capture(settings, made)[0]
-    exposure = np.exp(np.random.default_rng(0).normal(0, 0.7, 8))
-    factors = (exposure / exposure.max()).tolist()
+    exposure = np.exp(np.random.default_rng(0).normal(0, spread, (8, lights)))
     views = (
-        replace(view, samples=np.rint(view.samples * factor).astype(np.uint16)) for view, factor in zip(capture.views, factors, strict=True)
+        replace(view, samples=np.rint(view.samples * factors[:, None]).astype(np.uint16))
+        for view, factors in zip(capture.views, exposure / exposure.max(), strict=True)
     )
     found = reconstruct(Capture("made", tuple(views)), Settings("made", preset="draft"), None, Progress())
     turned = [angles_deg(a, b) for a, b in zip(found.lights.direction, made.lights.direction, strict=True)]
-    # Solved as if all views were as bright they are 17 deg off.
-    assert np.concatenate(turned).mean() < 0.5
-    np.testing.assert_allclose(strengths_of(found.lights), exposure / exposure.mean(), rtol=0.03)
+    # Solved as if all were as bright they are 17 and 2.2 deg off, where all are 0.3.
+    assert np.concatenate(turned).mean() < 0.9
+    relative = np.broadcast_to(exposure / exposure.mean(0), (8, 8))
+    np.testing.assert_allclose(strengths_of(found.lights), relative, rtol=0.03)
     (finding,) = found.metrics["findings"]
-    assert finding["about"] == "lights" and finding["mended"] and "exposures" in finding["text"]
+    assert finding["about"] == "lights" and finding["mended"] and words in finding["text"]

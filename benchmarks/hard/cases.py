@@ -118,6 +118,8 @@ def _photographs() -> Iterator[tuple[str, Callable[[], Sample]]]:
         yield f"ambient-{percent}-percent", partial(damaged, damage.ambient, percent / 100)
     for percent in (10, 40):
         yield f"exposures-{percent}-percent", partial(damaged, damage.exposed_anew, percent / 100)
+    for percent in (3, 10):
+        yield f"flicker-{percent}-percent", partial(damaged, damage.flickering, percent / 100)
     yield "images-swapped", partial(damaged, damage.two_swapped, 1)
     yield "image-black", partial(damaged, damage.one_black, 1)
     yield "image-of-another-object", partial(damaged, damage.one_foreign, 1)

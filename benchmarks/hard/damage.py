@@ -54,9 +54,18 @@ def fewer_bits(capture: Capture, bits: float, rng: np.random.Generator) -> Captu
 
 def exposed_anew(capture: Capture, spread: float, rng: np.random.Generator) -> Capture:
     """Every view with an exposure of its own, of this standard deviation of its logarithm; the longest as it was, none clipped."""
-    exposure = np.exp(rng.normal(0, spread, len(capture.views)))
-    exposures = iter(exposure / exposure.max())
-    return each_view(capture, lambda view: with_values(view, view.radiance() * next(exposures)))
+    return _dimmed(capture, [np.exp(rng.normal(0, spread, 1)) for _ in capture.views])
+
+
+def flickering(capture: Capture, spread: float, rng: np.random.Generator) -> Capture:
+    """The same of every photograph by itself, as lamps that flicker or flashes that differ from shot to shot."""
+    return _dimmed(capture, [np.exp(rng.normal(0, spread, len(view.lights))) for view in capture.views])
+
+
+def _dimmed(capture: Capture, strengths: list[Float]) -> Capture:
+    """Photographs as many times as bright as these (lights,) or (1,) of the views, over the largest of all."""
+    each = iter([of_view / max(one.max() for one in strengths) for of_view in strengths])
+    return each_view(capture, lambda view: with_values(view, view.radiance() * next(each)[:, None]))
 
 
 def gamma(capture: Capture, exponent: float, rng: np.random.Generator) -> Capture:

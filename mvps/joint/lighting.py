@@ -11,15 +11,16 @@ from mvps.camera import rig_frame, surface_pixel
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.colours import light_ratios
 from mvps.joint.grey import coloured_lights, grey_lights, tensor32
-from mvps.joint.lights import OfLaw, light_step, subset, told_by_shadows, with_mean_one
+from mvps.joint.lights import OfLaw, light_step, subset, told_by_shadows, told_of_strengths, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio
 from mvps.joint.patches import Patches
 from mvps.joint.reflectance import Observed
 from mvps.joint.state import State
 from mvps.joint.steps import Anchor, possible, vertex_step
-from mvps.joint.strengths import exposed_alike, strengths_in, strengths_of
+from mvps.joint.strengths import as_bright, needed, strengths_in, strengths_of, unknown_in
+from mvps.memory import room_for, solved_together
 from mvps.mesh import angles_deg, edges, lengths
-from mvps.scene import Capture, Law, Lights, Surface
+from mvps.scene import Capture, Lights, Surface
 
 LIGHT_VERTICES = 4000
 """Vertices, in patches, that stand for all when lights are solved."""
@@ -64,10 +65,10 @@ def solved_lights(
     patches: Patches,
     free_lights: bool,
     of_law: OfLaw,
-    alike: float | None,
+    least: float | None,
 ) -> tuple[Lights, float]:
     """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
-    alike: bound of `exposed_alike`; where views under one rig are not, how bright each is is solved as well. None: not to look for it.
+    least: of `needed`, by which photographs under one rig get strengths that are solved as well. None: no more than they have.
 
     Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
     """
@@ -77,25 +78,26 @@ def solved_lights(
     few, part, tie = subset(few, vertices, replace(anchor, sigma=LIGHT_TIE), patches.vertex)
     rotations = [tensor32(rig_frame(state.lights, view.camera), patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)
-    before, strengths = lights, strengths_of(state.lights)
-
-    def stepped(strengths: list[float] | None) -> tuple[list[DirectionalLights], Law]:
-        rig = state.lights.one_rig
-        return light_step(few, part, lights, state.law, tie, patches, rotations, rig, free_lights, of_law, strengths)
-
-    steps = LIGHT_STEPS
+    before, rig, steps = lights, state.lights.one_rig, LIGHT_STEPS
+    known = strengths_of(state.lights)
+    strengths = None if known is None else strengths_in(lights, unknown_in(known))
     while steps:
         steps -= 1
         before = lights
-        lights, state.law = stepped(strengths)
-        strengths = strengths and strengths_in(lights)
+        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, rig, free_lights, of_law, strengths)
+        strengths = strengths and strengths_in(lights, strengths.unknown)
         lights, part = with_mean_one(lights, part)
         for _ in range(2):
             part = vertex_step(few, part, lights, state.law, tie, patches=patches)
-        if not steps and alike is not None and strengths is None and free_lights and state.lights.one_rig:
-            exposed = strengths_in(stepped([1.0] * len(lights))[0])
-            # Lights that were solved as if all views were as bright are solved again, from farther off than a round's steps begin.
-            strengths, steps = (None, 0) if exposed_alike(exposed, alike) else ([1.0] * len(lights), 2 * LIGHT_STEPS)
+        if least is not None and free_lights and rig and not steps:
+            so_far = strengths or as_bright(lights)
+            told = told_of_strengths(few, part, lights, state.law, tie, patches, rotations, of_law, so_far)
+            unknown = needed(told, len(lights[0].intensity), least)
+            if unknown > (strengths.unknown if strengths else 0):
+                # Lights that were solved as if all were as bright are solved again, from farther off than a round's steps begin.
+                strengths, steps = replace(so_far, unknown=unknown), 2 * LIGHT_STEPS
+                state.together = solved_together(state.lights, unknown * len(lights))
+                room_for(len(state.surface.vertices), lights=state.together)
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)
     return solved, float(np.concatenate(turned).mean())

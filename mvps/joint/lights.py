@@ -14,15 +14,14 @@ mean slope (patches.py), which adds two multipliers each: with A_j, c, E there a
 Weights at their bound whose gradient keeps them there are no unknowns. A few thousand vertices say all there is to say about the lights,
 three unknowns each.
 
-Where views under one rig are exposed each anew (strengths.py), the logarithms of their strengths e_i are unknowns too: m of view i is e_i
-times the rig's, and so are its derivatives; by log e_i the derivative is the image.
+Where photographs under one rig are not as bright as its lamps make them (strengths.py), the logarithms of their strengths e are unknowns
+too, one for each view or one for each photograph: m is e times the rig's, and so are its derivatives; by log e the derivative is the image.
 
 float64 holds the reduced system: S is the small difference of two large matrices along the family.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -47,6 +46,7 @@ from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
 from mvps.joint.shadowed import TIMES, bounce_in_shadow
 from mvps.joint.steps import LARGEST_TURN, Anchor
+from mvps.joint.strengths import Strengths, Told
 from mvps.scene import Law
 from mvps.shading import returned
 from solvers.least_squares import damped_solution
@@ -82,47 +82,50 @@ def subset(views: list[ViewSamples], vertices: Vertices, anchor: Anchor, chosen:
 @dataclass(frozen=True)
 class _Layout:
     """Which lights are whose: of each view the number of its rig, one for all or one for each; of each rig the number of its lights, none
-    where they are known. The unknowns are the rigs' m, x of all lights, then y, then z, the views' strengths, none where all are as bright,
-    and those of the law."""
+    where they are known; how many strengths of each view are unknown: none, one, or one for each photograph. The unknowns are the rigs' m,
+    x of all lights, then y, then z, the strengths, view by view, and those of the law."""
 
     rig: list[int]
     lights: list[int]
     strengths: int
 
     def start(self, rig: int) -> int:
-        """Place of a rig's first unknown, or, after the last rig, of the first view's strength."""
+        """Place of a rig's first unknown, or, after the last rig, of the first strength."""
         return 3 * sum(self.lights[:rig])
 
+    def by_strength(self, values: Tensor) -> Tensor:
+        """Values (..., lights) of a view's photographs, by its unknown strengths."""
+        return values.sum(-1, keepdim=True) if self.strengths == 1 else values
 
-def _layout(lights: list[DirectionalLights], one_rig: bool, free: bool, strong: bool) -> _Layout:
+
+def _layout(lights: list[DirectionalLights], one_rig: bool, free: bool, strengths: int) -> _Layout:
     sizes = [len(of_view.intensity) for of_view in lights] if free else []
-    of_one = _Layout([0] * len(lights), sizes[:1], len(lights) if free and strong else 0)
+    of_one = _Layout([0] * len(lights), sizes[:1], strengths if free else 0)
     return of_one if one_rig else _Layout(list(range(len(lights))), sizes, 0)
 
 
 @dataclass(frozen=True)
-class _OfStrength:
-    """Products of the derivative by a view's strength: with those by vertices (V, p), by lights (3, lights), and with itself, those by the
-    law, and the residual (OF_LAW + 2,)."""
+class _OfStrengths:
+    """Products of the derivatives by the strengths of a view's n photographs: with those by vertices (V, p, n), or (V, p, 1) of a strength
+    that all have, with those by lights (3, n), and with themselves, those by the law, and the residual (OF_LAW + 2, n)."""
 
     vertices: Tensor
     lights: Tensor
     rest: Tensor
 
     @classmethod
-    def none(cls, like: Tensor, vertices: int, unknowns: int, lights: int) -> _OfStrength:
+    def none(cls, like: Tensor, vertices: tuple[int, int, int], lights: int) -> _OfStrengths:
         """Of no samples."""
-        double = torch.float64
-        return cls(like.new_zeros(vertices, unknowns), like.new_zeros(3, lights, dtype=double), like.new_zeros(OF_LAW + 2, dtype=double))
+        return cls(like.new_zeros(vertices), *(like.new_zeros(rows, lights, dtype=torch.float64) for rows in (3, OF_LAW + 2)))
 
     def add(self, index: Tensor, weighted: Tensor, heavy: Tensor, weight: Tensor, image: Tensor) -> None:
         """Adds the samples of n vertices (n,), in place: weighted (n, p + OF_LAW + 1, lights) and heavy (n, 3, lights) derivatives by
         vertices, law and lights with their weight (n, lights), and the image (n, lights)."""
-        along = (weighted * image[:, None]).sum(-1)
+        along = weighted * image[:, None]
         p = self.vertices.shape[1]
-        self.vertices.index_add_(0, index, along[:, :p])
+        self.vertices.index_add_(0, index, along[:, :p] if self.vertices.shape[2] > 1 else along[:, :p].sum(-1, keepdim=True))
         self.lights.add_((heavy * image[:, None]).sum(0))
-        self.rest[0] += (weight * image**2).sum()
+        self.rest[0] += (weight * image**2).sum(0)
         self.rest[1:].add_(along[:, p:].sum(0))
 
 
@@ -139,7 +142,7 @@ class _Sums:
     count: Tensor
     cross: dict[int, Tensor]
     lights: dict[int, Tensor]
-    strengths: dict[int, _OfStrength]
+    strengths: dict[int, _OfStrengths]
 
     def add(self, other: _Sums) -> None:
         """Adds sums over other views, in place."""
@@ -158,10 +161,11 @@ def _sums(
     law: Law,
     rotations: list[Tensor],
     rigs: list[int],
-    strengths: dict[int, float],
+    strengths: dict[int, Tensor],
+    unknown: int,
 ) -> _Sums:
     """Over some views with their lights, rotations and rigs, -1 where the lights are known; strengths: by number in the capture where they
-    are unknown, in the order of the views."""
+    are unknown, in the order of the views, and how many of each view are."""
     n, p, like = len(vertices.normal), 2 + vertices.reflectance.shape[1], vertices.normal
     size = {rig: len(of_view.intensity) for rig, of_view in zip(rigs, lights, strict=True) if rig >= 0}
     sums = _Sums(
@@ -169,7 +173,10 @@ def _sums(
         like.new_zeros(n),
         {rig: like.new_zeros(n, p, 3, count) for rig, count in size.items()},
         {rig: like.new_zeros(count, 3, 3 + OF_LAW + 1, dtype=torch.float64) for rig, count in size.items()},
-        {number: _OfStrength.none(like, n, p, len(of_view.intensity)) for number, of_view in zip(strengths, lights, strict=False)},
+        {
+            number: _OfStrengths.none(like, (n, p, unknown), len(of_view.intensity))
+            for number, of_view in zip(strengths, lights, strict=False)
+        },
     )
     numbers = list(strengths)
     first, second = tangents(vertices.normal)
@@ -188,8 +195,7 @@ def _sums(
             continue
         of_light = light_jacobian(shaded, normal, towards, batch.lights, law, torch.stack([rotations[i] for i in batch.views]))
         if strengths:
-            of_views = [strengths[numbers[i]] for i in batch.views]
-            of_light = of_light * torch.tensor(of_views, dtype=of_light.dtype, device=of_light.device)[:, None, None, None]
+            of_light = of_light * torch.stack([strengths[numbers[i]] for i in batch.views])[:, None, None]
         for k, view in enumerate(batch.views):
             rig = rigs[view]
             sums.cross[rig].index_add_(0, index[k], weighted[k, :, :p, None] * of_light[k, :, None])
@@ -209,7 +215,7 @@ def _coupled(
     law: Law,
     rotations: list[Tensor],
     layout: _Layout,
-    strengths: Sequence[float] | None,
+    strengths: Sequence[Tensor] | None,
 ) -> _Sums:
     """The sums over all views, dealt to the cores as `vertex_equations` deals them."""
     hands = min(WORKERS, len(views))
@@ -217,7 +223,7 @@ def _coupled(
 
     def dealt(k: int) -> _Sums:
         of_views = {} if strengths is None else {i: strengths[i] for i in range(k, len(views), hands)}
-        return _sums(views[k::hands], vertices, lights[k::hands], law, rotations[k::hands], rigs[k::hands], of_views)
+        return _sums(views[k::hands], vertices, lights[k::hands], law, rotations[k::hands], rigs[k::hands], of_views, layout.strengths)
 
     total, *others = on_cores(dealt, range(hands))
     for other in others:
@@ -229,7 +235,7 @@ def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
     """H_mm and g_m; the last OF_LAW of m are the law's."""
     of_law = sums.vertices[:, -OF_LAW - 1 :, -OF_LAW - 1 :].double().sum(0)
     first = layout.start(len(layout.lights))
-    unknowns = first + layout.strengths + OF_LAW
+    unknowns = first + layout.strengths * len(sums.strengths) + OF_LAW
     H, g = of_law.new_zeros(unknowns, unknowns), of_law.new_zeros(unknowns)
     law = slice(unknowns - OF_LAW, unknowns)
     H[law, law], g[law] = of_law[:-1, :-1], of_law[:-1, -1]
@@ -240,11 +246,15 @@ def _lights_equations(sums: _Sums, layout: _Layout) -> tuple[Tensor, Tensor]:
         H[own, law] = products[:, 3:-1].transpose(1, 2).reshape(-1, OF_LAW)
         H[law, own] = H[own, law].T
         g[own] = products[:, -1].reshape(-1)
-    for view, of_strength in sums.strengths.items():
-        own, at = slice(layout.start(layout.rig[view]), layout.start(layout.rig[view] + 1)), first + view
-        H[own, at] = H[at, own] = of_strength.lights.reshape(-1)
-        H[law, at] = H[at, law] = of_strength.rest[1:-1]
-        H[at, at], g[at] = of_strength.rest[0], of_strength.rest[-1]
+    for view, of_strengths in sums.strengths.items():
+        own = slice(layout.start(layout.rig[view]), layout.start(layout.rig[view] + 1))
+        at = slice(first + view * layout.strengths, first + (view + 1) * layout.strengths)
+        H[own, at] = layout.by_strength(torch.diag_embed(of_strengths.lights).flatten(0, 1))
+        H[at, own] = H[own, at].T
+        H[law, at] = layout.by_strength(of_strengths.rest[1:-1])
+        H[at, law] = H[law, at].T
+        H[at, at] = torch.diag(layout.by_strength(of_strengths.rest[0]))
+        g[at] = layout.by_strength(of_strengths.rest[-1])
     return H, g
 
 
@@ -262,11 +272,12 @@ def _blocks(sums: _Sums, vertices: Vertices, anchor: Anchor) -> Blocks:
     return Blocks(hessian, gradient * free, free)
 
 
-def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: OfLaw) -> Tensor:
-    """dm of the Schur complement. solved: grazing, bounce, gleam."""
+def _reduced(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anchor, patches: Patches, solved: OfLaw) -> tuple[Tensor, Tensor]:
+    """S of the Schur complement and the gradient beside it. solved: grazing, bounce, gleam."""
     H, g = _lights_equations(sums, layout)
     moved, A = patches.moved(vertices.normal)
-    by_strength = [torch.stack([sums.strengths[i].vertices for i in range(layout.strengths)], 2)] if layout.strengths else []
+    by_strength = [sums.strengths[i].vertices for i in sorted(sums.strengths)]
+    by_strength = [torch.cat(by_strength, 2)] if layout.strengths == 1 else by_strength
     by_law = sums.vertices[:, : -OF_LAW - 1, -OF_LAW - 1 : -1]
     derivatives = [*(sums.cross[rig].flatten(2) for rig in range(len(layout.lights))), *by_strength, by_law]
     reduced = eliminated(H, g, derivatives, _blocks(sums, vertices, anchor), A, patches)
@@ -282,7 +293,7 @@ def _reduced_step(sums: _Sums, layout: _Layout, vertices: Vertices, anchor: Anch
     still = torch.cat([torch.zeros(len(g) - OF_LAW, dtype=torch.bool), ~torch.tensor(solved)]).to(g.device)
     H[still], H[:, still], g[still] = 0, 0, 0
     diagonal[still] = 1
-    return -damped_solution(H, g)
+    return H, g
 
 
 def told_by_shadows(
@@ -308,39 +319,66 @@ def light_step(
     one_rig: bool,
     free_lights: bool = True,
     free: OfLaw = (True, True, True),
-    strengths: Sequence[float] | None = None,
+    strengths: Strengths | None = None,
 ) -> tuple[list[DirectionalLights], Law]:
     """One Gauss-Newton step of what is free of lights, grazing, bounce and gleam, with the vertices eliminated.
 
     rotations: from the world to the frames in which the views' lights are unknown (rig_frame in camera.py), float32.
-    strengths: how many times as bright as the rig's the lights of each view are, which is unknown as well (strengths.py); all the same if
-    None.
+    strengths: how many times as bright as the rig's lights photographs are, which is unknown as well (strengths.py); all as bright if None.
     """
-    layout = _layout(lights, one_rig, free_lights, strengths is not None)
-    strengths = strengths if layout.strengths else None
-    sums = _coupled(views, vertices, lights, law, rotations, layout, strengths)
-    step = _reduced_step(sums, layout, vertices, anchor, patches, free)
+    layout = _layout(lights, one_rig, free_lights, 0 if strengths is None else strengths.unknown)
+    of_views = strengths.of if strengths is not None and layout.strengths else None
+    sums = _coupled(views, vertices, lights, law, rotations, layout, of_views)
+    step = -damped_solution(*_reduced(sums, layout, vertices, anchor, patches, free))
     grazing, bounce, gleam = step[-OF_LAW:].tolist()
     law = _bounded(law, law.grazing + grazing, law.bounce + bounce, law.gleam + gleam, vertices)
     if not layout.lights:
         return lights, law
     stepped = []
-    first = layout.start(len(layout.lights))
-    brighter = step[first : first + layout.strengths].tolist()
+    brighter = step[layout.start(len(layout.lights)) : -OF_LAW].reshape(-1, max(layout.strengths, 1)).clamp(-LARGEST_TURN, LARGEST_TURN)
+    # What is common to all views is the lights' scale.
+    factor = (brighter - brighter.mean(0)).exp()
     for i, (of_view, rotation, rig) in enumerate(zip(lights, rotations, layout.rig, strict=True)):
         m = (of_view.direction * of_view.intensity[:, None]).double() @ rotation.double().T
         d = step[layout.start(rig) :][: m.numel()].reshape(3, -1).T
-        if strengths is not None:
-            d = strengths[i] * d
+        if of_views is not None:
+            d = of_views[i].double()[:, None] * d
         length = m.norm(dim=1, keepdim=True)
         d = d * (LARGEST_TURN * length / d.norm(dim=1, keepdim=True).clamp_min(1e-300)).clamp_max(1)
         m = m + d
-        if strengths is not None:
-            # What is common to all views is the lights' scale.
-            m = m * math.exp(brighter[i] - sum(brighter) / len(brighter))
+        if of_views is not None:
+            m = m * factor[i][:, None]
         intensity = m.norm(dim=1)
         stepped.append(DirectionalLights((m / intensity[:, None] @ rotation.double()).float(), intensity.float()))
     return stepped, law
+
+
+def told_of_strengths(
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    anchor: Anchor,
+    patches: Patches,
+    rotations: list[Tensor],
+    free: OfLaw,
+    strengths: Strengths,
+) -> Told:
+    """What strengths of one rig's photographs would be, and explain; arguments as in `light_step`. Those of views are solved together with
+    all else; those of photographs beside everything else, which leaves no less unexplained than together with it."""
+    layout = _layout(lights, True, True, 1)
+    sums = _coupled(views, vertices, lights, law, rotations, layout, strengths.of)
+    S, g = _reduced(sums, layout, vertices, anchor, patches, free)
+    first = layout.start(1)
+    others = torch.ones(len(g), dtype=torch.bool, device=g.device)
+    others[first : first + len(views)] = False
+    unexplained = sums.vertices[:, -1, -1].double().sum()
+    step = -damped_solution(S, g)
+    without = g[others] @ damped_solution(S[others][:, others], g[others])
+    information, gradient = (torch.stack([sums.strengths[i].rest[k] for i in range(len(views))]) for k in (0, -1))
+    photographs = (gradient**2 / information.clamp_min(1e-300)).sum() - (gradient.sum(1) ** 2 / information.sum(1).clamp_min(1e-300)).sum()
+    explained = torch.stack([without, -g @ step - without, photographs]) / unexplained
+    return Told(step[~others].tolist(), *explained.tolist())
 
 
 def _bounded(law: Law, grazing: float, bounce: float, gleam: float, vertices: Vertices) -> Law:

@@ -26,7 +26,7 @@ from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import all_pixel_normals
 from mvps.joint.state import State, grey_albedo, lit_by, material_of, relative_residuals, senders_of
 from mvps.joint.steps import free_reflectance, lambert_albedo, possible, vertex_step, vertex_steps, with_population
-from mvps.joint.strengths import ALIKE, ROUGHLY_ALIKE
+from mvps.joint.strengths import MUCH, SOME
 from mvps.joint.thinned import thinned
 from mvps.material import POOR_FIT
 from mvps.mesh import angles_deg, vertex_normals
@@ -87,13 +87,12 @@ def _lit(state: State, capture: Capture, few: list[ViewSamples], part: tuple[Cap
     return state.views if part[0] is capture else lit_by(state, few, capture, state.lights, sent)
 
 
-def _alike(state: State, vertices: Vertices, first: bool, last: bool) -> float | None:
-    """By how much views may seem to be exposed otherwise than each other in a round, the first one or one of the last; None: of no account,
-    for what differs was found before."""
-    # On a hull, and where the model fits badly, what is wrong with them looks like views that are not as bright.
+def _least(state: State, vertices: Vertices, first: bool, last: bool) -> float | None:
+    """What strengths of views have to explain (`needed`) in a round, the first one or one of the last; None: none is looked for, for what
+    differs was found before."""
     if first or float(relative_residuals(state.views, vertices).nanmedian()) > POOR_FIT:
-        return ROUGHLY_ALIKE
-    return None if last else ALIKE
+        return MUCH
+    return None if last else SOME
 
 
 def photometric_round(
@@ -138,8 +137,8 @@ def photometric_round(
     if carried is None and not state.lobed:
         few = relit(vertices)
         vertices, unknown = with_bounce(state, vertices, lights, free)
-    alike = _alike(state, vertices, carried is None, task.choose)
-    solved, light_step = solved_lights(state, capture, few, vertices, free, patches, task.free_lights, unknown, alike)
+    least = _least(state, vertices, carried is None, task.choose)
+    solved, light_step = solved_lights(state, capture, few, vertices, free, patches, task.free_lights, unknown, least)
     moved, state.lights = _light_change(state.lights, solved), solved
     lights = grey_lights(thinned(capture, state.lights)[1], device)
     vertices = vertex_step(state.views, vertices, lights, state.law, free, stated=False)

@@ -35,6 +35,7 @@ from mvps.joint.reflectance import Observed
 from mvps.joint.shown import OWN_SHARE, own_normals, shaded_as
 from mvps.joint.state import State, grey_albedo, material_of, relative_residuals, senders_in_colour
 from mvps.joint.stated import scatter, stated_errors
+from mvps.joint.strengths import unknown_of
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
@@ -243,7 +244,7 @@ def refine(
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     pixel = surface_pixel(capture, surface)
-    together = solved_together(lights) if settings.free_lights else 0
+    together = solved_together(lights, unknown_of(lights)) if settings.free_lights else 0
     state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), lobed=law.gleam > 0, together=together)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)

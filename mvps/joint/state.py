@@ -24,7 +24,7 @@ from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, Norm
 class State:
     """What one round hands to the next. noise: of dark pixels (noise.py); under: the photographs, perhaps thinned, that `views` are samples
     of, and their lights; lobed: whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and
-    with them, once a round asks for it; together: lights that are solved for at once (memory.py)."""
+    with them, once a round asks for it; together: lights, and strengths, that are solved for at once (memory.py)."""
 
     surface: Surface
     lights: Lights

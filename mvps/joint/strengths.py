@@ -1,43 +1,102 @@
-"""How bright the photographs of each view are, of views under one rig: cameras that expose every view anew, flashes that fade.
+"""How bright photographs under one rig are: of cameras that expose every view anew, flashes that fade or differ from shot to shot.
 
-The photographs of view i are e_i times as bright as the rig's lamps make them: its lights' intensities are e_i times the rig's. log e are
-unknowns of the lights' block (lights.py), with the image itself as derivative; what all views have in common is the lights' scale.
+The photograph of view i under light l is e_il times as bright as the rig's lamp makes it: the lights' intensities are e_il times the rig's.
+log e are unknowns of the lights' block (lights.py), with the image itself as derivative: one for each view, or one for each photograph.
+What all views have in common is the lights' scale.
+
+Which of them are unknown is decided by what they explain. With r^2 the weighted sum of squared residuals, g_il and h_il those of the image
+with the residual and with itself, strengths of photographs explain beside everything else, over those of views,
+
+    (sum_il g_il^2 / h_il - sum_i (sum_l g_il)^2 / sum_l h_il) / r^2
+
+and strengths of views, whose vertices' albedo makes up for most of them, g^T S^-1 g / r^2 with and without them, S the lights' system.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from mvps.joint.blocks import DirectionalLights
-from mvps.scene import Lights
+from mvps.scene import Float, Lights
 
 ROUNDING = 1e-4
-"""Relative difference of views' brightness that is rounding: directions are turned into every view's frame in single precision."""
+"""Relative difference of photographs' brightness that is rounding: directions are turned into every view's frame in single precision."""
 
-ALIKE, ROUGHLY_ALIKE = 0.03, 0.5
-"""Step of log e up to which views are exposed alike, and the same on a hull or where the model fits badly. Where they were alike it was
-0.026 at most (a plane; else 0.012), and 0.27 on the hull of a gear of gold (docs/findings/lights.md)."""
+ALIKE = 0.03
+"""Step of log e up to which views are exposed alike. Where they were it was 0.026 at most (a plane; else 0.012) in coarse rounds that fit
+(docs/findings/lights.md)."""
 
+SOME, MUCH = 0.01, 0.1
+"""Part of what is unexplained that longer steps have to explain, and the same on a hull and where the model fits badly, for what is wrong
+there looks like views that are not as bright. Exposures of a tenth explain 0.012 and more on surfaces that fit, a view of another object
+0.006; on hulls others explain 0.06 at most, exposures 0.1 to 0.9 on most (docs/findings/lights.md)."""
 
-def strengths_of(lights: Lights) -> list[float] | None:
-    """e of views under one rig, their mean 1; None where all are as bright, and without a rig."""
-    found = _relative([of_view.sum() for of_view in lights.intensity])
-    return found if lights.one_rig and max(abs(e - 1) for e in found) >= ROUNDING else None
-
-
-def strengths_in(lights: Sequence[DirectionalLights]) -> list[float]:
-    """e of the views' lights, all of one rig, their mean 1."""
-    return _relative([float(of_view.intensity.double().sum()) for of_view in lights])
+MOST = 0.25
+"""Part of what is unexplained from which on photographs have strengths of their own: 0.21 at most where all were as bright (a hull of
+bricks), 0.26 to 0.7 under lamps that flicker by 3 % on most hulls (docs/findings/lights.md)."""
 
 
-def _relative(sums: Sequence[float]) -> list[float]:
-    relative: list[float] = (np.array(sums) / np.mean(sums)).tolist()
-    return relative
+@dataclass(frozen=True, eq=False)
+class Strengths:
+    """of: e of each view's photographs (lights,); unknown: how many of a view are, one or one for each photograph."""
+
+    of: list[Tensor]
+    unknown: int
 
 
-def exposed_alike(strengths: Sequence[float], bound: float = ALIKE) -> bool:
-    """Whether views are as bright, as far as surfaces and models that are not exact can tell."""
-    step = np.log(strengths)
-    return bool(np.abs(step - step.mean()).max() <= bound)
+@dataclass(frozen=True)
+class Told:
+    """Next steps, and the part of what is unexplained that they explain. of_views: steps of the logarithms of views' strengths; lights: all
+    other steps; views: those of views, over these; photographs: those of single photographs, over those of views."""
+
+    of_views: list[float]
+    lights: float
+    views: float
+    photographs: float
+
+
+def as_bright(lights: Sequence[DirectionalLights]) -> Strengths:
+    """Strengths of views that are as bright as the rig makes them."""
+    return Strengths([torch.ones_like(of_view.intensity) for of_view in lights], 1)
+
+
+def strengths_of(lights: Lights) -> Float | None:
+    """e (views, lights) of photographs under one rig, the mean of a light's 1; None where all are as bright, without a rig, and where views
+    have other lights of it."""
+    if not lights.one_rig or len({len(of_view) for of_view in lights.intensity}) > 1:
+        return None
+    intensity = np.array([of_view.mean(1) for of_view in lights.intensity])
+    found: Float = intensity / intensity.mean(0)
+    return found if np.abs(found - 1).max() >= ROUNDING else None
+
+
+def unknown_in(strengths: Float) -> int:
+    """How many of a view's strengths (views, lights) are unknowns: one where its photographs have the same."""
+    apart = strengths / strengths.mean(1, keepdims=True) - 1
+    return strengths.shape[1] if np.abs(apart).max() >= ROUNDING else 1
+
+
+def unknown_of(lights: Lights) -> int:
+    """How many strengths of all views are unknowns."""
+    known = strengths_of(lights)
+    return 0 if known is None else len(known) * unknown_in(known)
+
+
+def strengths_in(lights: Sequence[DirectionalLights], unknown: int) -> Strengths:
+    """e of the lights of a rig's views, as many unknowns of each."""
+    intensity = torch.stack([of_view.intensity for of_view in lights])
+    return Strengths(list(intensity / intensity.double().mean(0).to(intensity.dtype)), unknown)
+
+
+def needed(told: Told, lights: int, least: float) -> int:
+    """How many unknown strengths a view of so many lights needs. least: part of what is unexplained that those of views have to explain."""
+    # Lights on their way explain more than what is wrong with them looks like.
+    if lights > 1 and told.photographs > max(MOST, told.lights):
+        return lights
+    step = np.array(told.of_views)
+    return int(np.abs(step - step.mean()).max() > ALIKE and told.views >= least)
