@@ -15,7 +15,19 @@ from mvps.joint.grey import coloured_lights, grey_lights
 from mvps.joint.lights import light_step, told_of_strengths, with_mean_one
 from mvps.joint.observe import ViewSamples, channel_ratio, observe
 from mvps.joint.steps import free_reflectance, vertex_step
-from mvps.joint.strengths import MUCH, SOME, Strengths, Told, as_bright, needed, strengths_in, strengths_of, unknown_in, unknown_of
+from mvps.joint.strengths import (
+    MUCH,
+    SOME,
+    Strengths,
+    Told,
+    as_bright,
+    needed,
+    of_photographs,
+    strengths_in,
+    strengths_of,
+    unknown_in,
+    unknown_of,
+)
 from mvps.mesh import angles_deg
 from mvps.outcome import all_lights
 from mvps.progress import Progress
@@ -130,6 +142,19 @@ def test_what_strengths_need_to_explain() -> None:
     assert needed(Told(alike, 0.0, 0.5, 0.2), 4, MUCH) == 0 and needed(Told(alike, 0.0, 0.0, 0.3), 4, MUCH) == 4
     # Lights that have not settled look like photographs that differ; with one light a view's strength is its photograph's.
     assert needed(Told(alike, 0.6, 0.0, 0.5), 4, MUCH) == 0 and needed(Told(alike, 0.0, 0.0, 0.5), 1, MUCH) == 0
+
+
+def test_a_black_photograph_is_no_flicker(scene: SphereScene) -> None:
+    black = np.ones((6, 10))
+    black[3, 2] = 0
+    told = solved(scene, black, 0).told
+    assert needed(told, 10, MUCH) == 0
+    information = torch.ones(6, 10, dtype=torch.float64)
+    gradient = torch.tensor(FLICKER - 1, dtype=torch.float64)
+    each = (gradient - gradient.mean(1, keepdim=True)) ** 2
+    assert float(of_photographs(gradient, information)) == pytest.approx(float(each.sum()))
+    gradient[3, 2] = -1
+    assert float(of_photographs(gradient, information)) < 3 * float(each.sum()) < 0.5
 
 
 def test_strengths_are_told_from_the_lights_of_a_rig(scene: SphereScene) -> None:

@@ -46,7 +46,7 @@ from mvps.joint.observe import ViewSamples
 from mvps.joint.patches import Patches
 from mvps.joint.shadowed import TIMES, bounce_in_shadow
 from mvps.joint.steps import LARGEST_TURN, Anchor
-from mvps.joint.strengths import Strengths, Told
+from mvps.joint.strengths import Strengths, Told, of_photographs
 from mvps.scene import Law
 from mvps.shading import returned
 from solvers.least_squares import damped_solution
@@ -376,7 +376,7 @@ def told_of_strengths(
     step = -damped_solution(S, g)
     without = g[others] @ damped_solution(S[others][:, others], g[others])
     information, gradient = (torch.stack([sums.strengths[i].rest[k] for i in range(len(views))]) for k in (0, -1))
-    photographs = (gradient**2 / information.clamp_min(1e-300)).sum() - (gradient.sum(1) ** 2 / information.sum(1).clamp_min(1e-300)).sum()
+    photographs = of_photographs(gradient, information)
     explained = torch.stack([without, -g @ step - without, photographs]) / unexplained
     return Told(step[~others].tolist(), *explained.tolist())
 
