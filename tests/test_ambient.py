@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from mvps.checks import ambient as checks
-from mvps.checks.ambient import ambient, ambient_share
+from mvps.checks.ambient import ambient
 from mvps.checks.radiometry import is_metal
 from mvps.scene import Capture, View
 from mvps.synthetic.scene import render_capture
@@ -41,6 +41,10 @@ def with_ambient(capture: Capture, share: float) -> Capture:
     return Capture(capture.name, tuple(lit(view, share) for view in capture.views))
 
 
+def share_of(capture: Capture) -> float:
+    return checks._share(checks._told(checks._enough(capture)))
+
+
 @pytest.mark.parametrize(("seed", "strength", "noise"), [(0, 1.0, 0.002), (1, 0.0, 0.002), (2, 2.0, 0.01), (3, 1.0, 0.03)])
 def test_photographs_without_stay_as_they_are(seed: int, strength: float, noise: float) -> None:
     capture = clean(seed, strength, noise)
@@ -58,7 +62,7 @@ def test_it_is_found_and_most_of_it_taken_off(share: float) -> None:
         scale = np.median(mended.samples[lit_] / before.samples[lit_])
         off, was = (np.abs(v.samples / scale - before.samples)[lit_].mean() for v in (mended, harmed))
         assert off < 0.6 * was
-    assert ambient_share(after) < 0.3 * ambient_share(given)
+    assert share_of(after) < 0.3 * share_of(given)
 
 
 def parts(before: Capture, after: Capture) -> np.ndarray:
@@ -98,7 +102,7 @@ def test_inter_reflection_is_none() -> None:
         # What a lamp sends comes back from all around, a tenth of it.
         sent = 0.1 * np.median(view.samples, axis=0, keepdims=True) + 0.9 * view.samples
         views.append(replace(view, samples=np.rint(sent).astype(np.uint16)))
-    assert ambient_share(Capture("lit", tuple(views))) == 0
+    assert share_of(Capture("lit", tuple(views))) == 0
 
 
 @pytest.mark.parametrize(("sides", "weight", "sharpness"), [(6, (1.0,), (8.0,)), (6, (0.6, 0.6), (5.0, 30.0)), (5, (1.0,), (8.0,))])

@@ -137,17 +137,13 @@ def _line(f: _Factors) -> tuple[float, float, float]:
     return float(a), float(k * level.mean()), float(np.median(q))
 
 
-def ambient_share(capture: Capture) -> float:
-    """a of the module's docstring; 0 where it is not to be believed or cannot be told."""
-    return _share(_told(_enough(capture)))
-
-
 def _enough(capture: Capture) -> list[View]:
     """Views of enough lights."""
     return [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
 
 
 def _share(factors: Sequence[_Factors | None]) -> float:
+    """a of the module's docstring; 0 where it is not to be believed or cannot be told."""
     nothing = (float("nan"),) * 3
     lines = np.array([nothing if f is None else _line(f) for f in factors]).reshape(-1, 3)
     told = np.isfinite(lines[:, 0])
