@@ -33,10 +33,11 @@ ALIKE = 0.03
 """Step of log e up to which views are exposed alike. Where they were it was 0.026 at most (a plane; else 0.012) in coarse rounds that fit
 (docs/findings/lights.md)."""
 
-SOME, MUCH = 0.01, 0.1
+SOME, MUCH = 0.02, 0.1
 """Part of what is unexplained that longer steps have to explain, and the same on a hull and where the model fits badly, for what is wrong
-there looks like views that are not as bright. Exposures of a tenth explain 0.012 and more on surfaces that fit, a view of another object
-0.006; on hulls others explain 0.06 at most, exposures 0.1 to 0.9 on most (docs/findings/lights.md)."""
+there looks like views that are not as bright. On surfaces that fit exposures of a tenth explain 0.5, in three views 0.036 and more, a view
+of another object 0.006, a wrong shape of three views 0.010; on hulls others explain 0.06 at most, exposures 0.1 to 0.9 on most
+(docs/findings/lights.md)."""
 
 MOST = 0.22
 """Part of what is unexplained from which on photographs have strengths of their own: 0.19 at most where all were as bright (a plane, the
