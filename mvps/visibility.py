@@ -178,7 +178,9 @@ def shade_of(caster: RayCaster, vertices: Int, lights: Float, margin: int) -> Sh
     around = caster.around[vertices]
     for _ in range(margin - 1):
         around = around @ caster.around
-    near = np.unique(around.indices)
+    close = np.zeros(around.shape[1], bool)
+    close[around.indices] = True
+    near = np.flatnonzero(close)
     around, shadow = around[:, near], cast_shadow(caster, near, lights)
     own, facing = np.searchsorted(near, vertices), caster.vertex_normals[near] @ lights.T > 0
     beside, deep = np.zeros((2, len(vertices), len(lights)), bool)

@@ -20,7 +20,8 @@ def test_each_check_gets_what_those_before_it_made(monkeypatch: pytest.MonkeyPat
     def renamed(capture: Capture) -> tuple[Capture, list[Finding]]:
         return Capture(f"{capture.name}+", capture.views), [Finding("view", capture.name, "seen", True)]
 
-    monkeypatch.setattr(mvps.sound, "CHECKS", (renamed, renamed))
+    for checks in ("OF_VALUES", "OF_LINEAR"):
+        monkeypatch.setattr(mvps.sound, checks, (renamed,))
     capture, progress = make_sphere().capture, Progress()
     after, findings = sound(capture, progress)
     assert after.name == f"{capture.name}++"

@@ -38,9 +38,9 @@ class Case(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def base() -> tuple[Capture, Truth]:
+def base(settings: SceneSettings = BASE) -> tuple[Capture, Truth]:
     """The good capture that is damaged."""
-    return rendered(BASE)
+    return rendered(settings)
 
 
 def of_scene(settings: SceneSettings = BASE, change: Change | None = None, take: Photograph | None = None) -> Sample:
@@ -54,9 +54,9 @@ def of_shape(shape: Callable[[], Surface], take: Photograph | None = None, arc: 
     return of_scene(change=lambda _: scenes.shaped_as(shape(), arc=arc), take=take)
 
 
-def damaged(by: Damage, amount: float) -> Sample:
-    """The base damaged; chance starts anew for every case."""
-    good, truth = base()
+def damaged(by: Damage, amount: float, settings: SceneSettings = BASE) -> Sample:
+    """The base, or one of other settings, damaged; chance starts anew for every case."""
+    good, truth = base(settings)
     return Sample(by(good, amount, np.random.default_rng(0)), good, truth)
 
 
@@ -114,6 +114,8 @@ def _photographs() -> Iterator[tuple[str, Callable[[], Sample]]]:
         yield f"noise-{percent}-percent", partial(of_scene, replace(BASE, noise=percent / 100))
     yield "8-bits", partial(damaged, damage.fewer_bits, 8)
     yield "gamma-2.2", partial(damaged, damage.gamma, 2.2)
+    yield "gamma-2.2-6-lights", partial(damaged, damage.gamma, 2.2, replace(BASE, lights=6))
+    yield "gamma-2.2-noise-3-percent", partial(damaged, damage.gamma, 2.2, replace(BASE, noise=0.03))
     for percent in (5, 20):
         yield f"ambient-{percent}-percent", partial(damaged, damage.ambient, percent / 100)
     for percent in (10, 40):

@@ -36,14 +36,16 @@ Curve = Callable[[Float], Float]
 """From code values to radiance, both over full scale."""
 
 
-def _power(exponent: float) -> Curve:
+def power(exponent: float) -> Curve:
+    """code^exponent."""
+
     return lambda code: np.asarray(code, np.float64) ** exponent
 
 
-LINEAR = _power(1.0)
+LINEAR = power(1.0)
 
 CURVES: Mapping[str, Curve] = MappingProxyType(
-    {"sRGB": linear_of_srgb, "gamma 2.2": _power(2.2), "gamma 1.8": _power(1.8), "gamma 2.4": _power(2.4)}
+    {"sRGB": linear_of_srgb, "gamma 2.2": power(2.2), "gamma 1.8": power(1.8), "gamma 2.4": power(2.4)}
 )
 """Those of displays and of files for them."""
 
@@ -63,7 +65,7 @@ PIXELS, VIEWS, SWEEPS = 300, 8, 6
 FULL = 65535
 
 
-def _over_its_level(image: Float) -> Float:
+def over_its_level(image: Float) -> Float:
     """Values (pixels, lights), each light's over their bright level."""
     level: Float = np.quantile(image, BRIGHT_QUANTILE, axis=0)
     return image / np.maximum(level, 1e-12)
@@ -73,8 +75,8 @@ def _rho(view: View, curve: Curve, pixels: int) -> float:
     """rho of a view's photographs with a curve undone."""
     chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:pixels])
     codes = view.samples[chosen][:, view.shown]
-    image = _over_its_level(curve(codes * view.scale).mean(-1))
-    order = np.argsort(np.argsort(_over_its_level(codes.mean(-1)), axis=1), axis=1)
+    image = over_its_level(curve(codes * view.scale).mean(-1))
+    order = np.argsort(np.argsort(over_its_level(codes.mean(-1)), axis=1), axis=1)
     known = (codes < view.saturation).all(-1) & (order >= (1 - LIT_SHARE) * codes.shape[1]) & (codes.min(-1) > 0)
     bright = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True), 1e-12)
     M = image / bright
@@ -89,12 +91,17 @@ def _log_rho(views: list[View], curve: Curve) -> NDArray[np.float64]:
     return np.log(np.maximum(on_cores(lambda view: _rho(view, curve, PIXELS), views), 1e-6))
 
 
+def some_views(capture: Capture, lights: int) -> list[View]:
+    """VIEWS of the capture's, or fewer, evenly spread over those of at least so many lights."""
+    enough = [view for view in capture.views if int(view.shown.sum()) >= lights]
+    return [enough[i] for i in np.unique(np.linspace(0, max(len(enough) - 1, 0), min(VIEWS, len(enough))).round().astype(int))]
+
+
 def left_in(capture: Capture) -> tuple[str, float] | None:
     """The name of the curve that was left in all photographs, and by which factor undoing it lowers rho; None where there is none."""
-    enough = [view for view in capture.views if int(view.shown.sum()) >= FEWEST_LIGHTS]
-    if not enough:
+    some = some_views(capture, FEWEST_LIGHTS)
+    if not some:
         return None
-    some = [enough[i] for i in np.unique(np.linspace(0, len(enough) - 1, VIEWS).round().astype(int))]
     linear = _log_rho(some, LINEAR)
     # The curves are alike: where one of them is no better than none, neither is another.
     if not np.nanmean(linear - _log_rho(some, CURVES["gamma 2.2"])) > 0:
