@@ -74,8 +74,9 @@ def misfit(capture: Capture, exponent: float) -> float:
 
 
 def contrast(capture: Capture) -> float:
-    """Mean logarithm of the root mean square over the geometric mean of a pixel's lit samples."""
-    return float(np.concatenate(on_cores(_contrast, capture.views)).mean())
+    """Mean logarithm of the root mean square over the geometric mean of a pixel's lit samples; inf where no pixel has two."""
+    of_pixels = np.concatenate(on_cores(_contrast, capture.views))
+    return float(of_pixels.mean()) if len(of_pixels) else np.inf
 
 
 def _contrast(view: View) -> Float:

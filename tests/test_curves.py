@@ -134,3 +134,4 @@ def test_contrast_is_that_of_three_quarters() -> None:
     first = np.log((100**2 + 200**2 + 400**2) / 3) / 2 - np.log(100 * 200 * 400) / 3
     assert contrast(view_of(values)) == pytest.approx(first / 2)
     assert contrast(view_of(values[:1] * 3)) == pytest.approx(first)
+    assert contrast(view_of(np.full((2, 4), saturated))) == np.inf
