@@ -6,6 +6,7 @@ exit code   0 done,  2 bad input (one sentence on standard error),  129, 130, 14
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import errno
 import gc
@@ -17,9 +18,11 @@ import re
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import NoReturn
 
 from mvps.addresses import loading
@@ -89,6 +92,27 @@ class _Ended(KeyboardInterrupt):
     """By a signal whose number is its first argument: nothing half-written stays."""
 
 
+TAKING = (threading.Condition.__enter__.__code__, threading.Condition.__exit__.__code__)
+"""Code in which a lock of Python's own is held by no `with` yet, or no more: what leaves it there by an exception leaves it locked, and
+threads that want it, and what waits for these, wait for ever."""
+
+A_MOMENT = 1e-3
+"""Seconds after which a request is made again that came in TAKING."""
+
+
+def _taking(frame: FrameType | None) -> bool:
+    """Whether one of the frames, from the innermost outwards, is in TAKING."""
+    while frame is not None and frame.f_code not in TAKING:
+        frame = frame.f_back
+    return frame is not None
+
+
+def _ask_again(number: int) -> None:
+    """Makes the request once more."""
+    time.sleep(A_MOMENT)
+    os.kill(os.getpid(), number)
+
+
 @contextmanager
 def _signals() -> Iterator[None]:
     """While a command runs, a request to end is an exception. Where a caller has his own way with a signal, that stays."""
@@ -97,7 +121,10 @@ def _signals() -> Iterator[None]:
     asked = [number for number, way in before.items() if mine and way in (signal.SIG_DFL, signal.default_int_handler)]
     came: list[int] = []
 
-    def end(number: int, _: object) -> NoReturn:
+    def end(number: int, frame: FrameType | None) -> None:
+        if _taking(frame):
+            _thread.start_new_thread(_ask_again, (number,))
+            return
         came.append(number)
         raise _Ended(number)
 

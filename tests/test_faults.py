@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -247,6 +248,41 @@ def test_capture_and_result_whose_names_are_no_text(capture: Path, tmp_path: Pat
 
 
 # ------------------------------------------------------------------------------------------------ interruptions
+
+
+@pytest.mark.usefixtures("interruptible")
+@pytest.mark.parametrize("leaving", [False, True])
+def test_an_interruption_leaves_no_lock_taken(leaving: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    """Raised while a pool's condition was being entered, it left the condition locked, and threads and the program waited for ever."""
+
+    class Lock:
+        """Interrupted as soon as it is taken, or just before it is let go."""
+
+        def __init__(self) -> None:
+            self.inner = threading.Lock()
+            self.acquire, self.release = self.inner.acquire, self.inner.release
+
+        def __enter__(self) -> None:
+            self.inner.acquire()
+            if not leaving:
+                signal.raise_signal(signal.SIGINT)
+
+        def __exit__(self, *_: object) -> None:
+            if leaving:
+                signal.raise_signal(signal.SIGINT)
+            self.inner.release()
+
+    lock, went_on = Lock(), []
+
+    def work(_: Sequence[str]) -> None:
+        with threading.Condition(lock):  # type: ignore[arg-type]
+            went_on.append(True)
+        time.sleep(10)
+        went_on.append(False)
+
+    assert run(work, []) == 130 and went_on == [True]
+    assert lock.inner.acquire(blocking=False), "it is still taken"
+    assert "interrupted before the end" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("interruptible")
