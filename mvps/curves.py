@@ -39,7 +39,8 @@ half of them exponents under noise come out 0.3 too large (docs/findings/checks.
 
 def exponent_left_in(under: Callable[[float], Capture]) -> tuple[float, float] | None:
     """The exponent that was left in photographs, and by which factor less is unexplained with it undone; None where that is less than
-    BETTER. under(e): the capture with what is recorded to the power of e, and checked. What cannot be solved is as bad as can be."""
+    BETTER or grows to the end of EXPONENTS. under(e): the capture with what is recorded to the power of e, and checked. What cannot be
+    solved is as bad as can be, and next to it nothing is told."""
     found: list[float] = []
     for exponent in EXPONENTS:
         try:
@@ -50,13 +51,12 @@ def exponent_left_in(under: Callable[[float], Capture]) -> tuple[float, float] |
             break
     best = int(np.argmin(found))
     gain = found[0] - found[best]
-    if not gain >= np.log(BETTER):
+    # What gets ever better the farther it is bent is no curve of a display but a shape that is not understood (a plane).
+    if not gain >= np.log(BETTER) or best + 1 == len(found) or np.isinf(found[best + 1]):
         return None
-    exponent = EXPONENTS[best]
-    if best + 1 < len(found) and np.isfinite(found[best + 1]):
-        before, at, after = found[best - 1 : best + 2]
-        exponent += (EXPONENTS[1] - EXPONENTS[0]) * (before - after) / (before + after - 2 * at) / 2
-    return exponent, float(np.exp(gain))
+    before, at, after = found[best - 1 : best + 2]
+    step = (EXPONENTS[1] - EXPONENTS[0]) * (before - after) / (before + after - 2 * at) / 2
+    return EXPONENTS[best] + step, float(np.exp(gain))
 
 
 def misfit(capture: Capture, exponent: float) -> float:

@@ -87,7 +87,7 @@ def test_of_a_metal_nothing_is_tried(monkeypatch: pytest.MonkeyPatch) -> None:
         (lambda e: 2 * (e - 1.7) ** 2, (1.0, 1.4, 1.8, 2.2), 1.7),
         (lambda e: 2 * (e - 1.3) ** 2, (1.0, 1.4, 1.8), None),
         (lambda e: e, (1.0, 1.4), None),
-        (lambda e: -e, (1.0, 1.4, 1.8, 2.2, 2.6), 2.6),
+        (lambda e: -e, (1.0, 1.4, 1.8, 2.2, 2.6), None),
     ],
     ids=["between steps", "a gain too small", "none", "beyond all"],
 )
@@ -107,16 +107,15 @@ def test_exponents_are_tried_until_they_get_worse(monkeypatch: pytest.MonkeyPatc
         assert found is not None and found[0] == pytest.approx(told) and found[1] > BETTER
 
 
-@pytest.mark.parametrize(("fails", "told"), [(1.0, None), (1.4, None), (2.2, 1.8)])
-def test_what_cannot_be_solved_is_no_exponent(monkeypatch: pytest.MonkeyPatch, fails: float, told: float | None) -> None:
+@pytest.mark.parametrize("fails", [1.0, 1.4, 2.2])
+def test_where_something_cannot_be_solved_no_exponent_is_told(monkeypatch: pytest.MonkeyPatch, fails: float) -> None:
     def misfit(_: Capture, exponent: float) -> float:
         if exponent == fails:
             raise CaptureError("lights: wanted some, given none")
         return -exponent
 
     monkeypatch.setattr(mvps.curves, "misfit", misfit)
-    found = exponent_left_in(lambda _: made(6, 0.003))
-    assert (found and found[0]) == told
+    assert exponent_left_in(lambda _: made(6, 0.003)) is None
 
 
 def view_of(values: Float) -> Capture:
