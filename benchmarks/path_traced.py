@@ -77,6 +77,8 @@ CASES = {
     "lumps-brushed": Case(207, "brushed", SceneSettings(seed=207)),
     "cheese-bright": Case("cheese", "bright", SceneSettings(seed=208, views=12)),
     "statue-wide": Case("statue", "plastic", SceneSettings(seed=209, lights=16, spread=80)),
+    "bolt-aluminium": Case("bolt", "aluminium", SceneSettings(seed=706)),
+    "gem-aluminium": Case("gem", "aluminium", SceneSettings(seed=717)),
 }
 
 

@@ -21,6 +21,7 @@ from mvps.joint.strengths import (
     Strengths,
     Told,
     as_bright,
+    borne_out,
     needed,
     of_photographs,
     strengths_in,
@@ -38,6 +39,7 @@ from mvps.synthetic.settings import SceneSettings
 
 CPU = torch.device("cpu")
 EXPOSURE = np.array([0.7, 1.3, 1.0, 0.8, 1.5, 0.9])
+APART = [0.1, -0.1, 0.1, -0.1]
 FLICKER = np.exp(np.random.default_rng(3).normal(0, 0.05, (6, 10)))
 
 
@@ -142,6 +144,26 @@ def test_what_strengths_need_to_explain() -> None:
     assert needed(Told(alike, 0.0, 0.5, 0.2), 4, MUCH) == 0 and needed(Told(alike, 0.0, 0.0, 0.3), 4, MUCH) == 4
     # Lights that have not settled look like photographs that differ; with one light a view's strength is its photograph's.
     assert needed(Told(alike, 0.6, 0.0, 0.5), 4, MUCH) == 0 and needed(Told(alike, 0.0, 0.0, 0.5), 1, MUCH) == 0
+
+
+def test_strengths_stay_where_what_they_explain_is_gone() -> None:
+    told = Told([0.2, -0.1, -0.1], 0.0, 0.04, 0.4)
+    assert borne_out(told, 4, 0.05, 0.03) and not borne_out(told, 4, 0.05, 0.047) and not borne_out(told, 4, 0.05, 0.06)
+    assert borne_out(told, 1, 0.05, 0.049) and not borne_out(told, 1, 0.05, 0.0499)
+
+
+@pytest.mark.parametrize("wrongly", [Told(APART, 0.0, 0.0, 0.3), Told(APART, 0.0, 0.3, 0.0)], ids=["photographs", "views"])
+def test_strengths_that_leave_as_much_unexplained_are_undone(monkeypatch: pytest.MonkeyPatch, wrongly: Told) -> None:
+    tried = []
+
+    def told(*_: object) -> Told:
+        tried.append(wrongly)
+        return wrongly
+
+    monkeypatch.setattr("mvps.joint.lighting.told_of_strengths", told)
+    settings = SceneSettings(views=4, lights=8, size=72)
+    found = reconstruct(render_capture(settings)[0], Settings("made", preset="draft"), None, Progress())
+    assert tried and strengths_of(found.lights) is None and not found.metrics["findings"]
 
 
 def test_a_black_photograph_is_no_flicker(scene: SphereScene) -> None:

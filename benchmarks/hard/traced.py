@@ -14,6 +14,8 @@ Shapes are zero sets of functions f of x in the unit ball, negative inside; s(f,
     nut       six sides, chamfers, a bore with a thread
     coin      a disc with a rim, in it a net of low bumps
     steps     four discs on each other
+    bolt      a head with six sides, a shaft with a thread
+    gem       a stone with 26 flat sides
 
 A photograph is the radiance of paths up to BOUNCES segments under one directional light, PATHS of them a sub-pixel; imported only where
 Mitsuba is there (pip install mvps[mitsuba]).
@@ -180,10 +182,16 @@ def mug(x: Float) -> Float:
     return np.asarray(np.maximum(np.minimum(disc(x, 0.5, 0, 0.6), handle), -inside))
 
 
+def six_sides(x: Float) -> Float:
+    """Distance (n,) to the z axis across the nearest side of a hexagon around it."""
+    towards = np.array([0, 1, 2]) * np.pi / 3
+    return np.asarray(np.abs(x[:, 0, None] * np.cos(towards) + x[:, 1, None] * np.sin(towards)).max(1))
+
+
 def nut(x: Float) -> Float:
     """A hexagonal nut."""
-    towards, radius = np.array([0, 1, 2]) * np.pi / 3, round_z(x)
-    sides = (np.abs(x[:, 0, None] * np.cos(towards) + x[:, 1, None] * np.sin(towards)) - 0.6).max(1)
+    radius = round_z(x)
+    sides = six_sides(x) - 0.6
     thread = 0.3 + 0.03 * np.sin(2 * np.pi * x[:, 2] / 0.16 + np.arctan2(x[:, 1], x[:, 0]))
     chamfer = (radius + np.abs(x[:, 2]) * 1.7 - 1.25) * 0.5
     return np.asarray(np.max([sides, np.abs(x[:, 2]) - 0.4, chamfer, (thread - radius) * 0.7], axis=0))
@@ -204,6 +212,23 @@ def steps(x: Float) -> Float:
     )
 
 
+def bolt(x: Float) -> Float:
+    """Head up."""
+    radius = round_z(x)
+    thread = 0.22 + 0.03 * np.sin(2 * np.pi * x[:, 2] / 0.12 + np.arctan2(x[:, 1], x[:, 0]))
+    shaft = np.maximum((radius - thread) * 0.7, np.abs(x[:, 2] + 0.2) - 0.6)
+    head = np.maximum(six_sides(x) - 0.42, np.abs(x[:, 2] - 0.6) - 0.18)
+    return np.asarray(np.minimum(shaft, head))
+
+
+def gem(x: Float) -> Float:
+    """Sides by chance."""
+    rng = np.random.default_rng(8)
+    towards = rng.normal(size=(26, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    return np.asarray((x @ towards.T - rng.uniform(0.55, 0.7, 26)).max(1))
+
+
 SHAPES: dict[str, Callable[[], Function]] = {
     "statue": lambda: statue,
     "knot": knot,
@@ -217,6 +242,8 @@ SHAPES: dict[str, Callable[[], Function]] = {
     "nut": lambda: nut,
     "coin": lambda: coin,
     "steps": lambda: steps,
+    "bolt": lambda: bolt,
+    "gem": lambda: gem,
 }
 
 
@@ -245,6 +272,7 @@ INLAID: dict[str, Any] = {"type": "mesh_attribute", "name": "vertex_inlay"}
 MATT: dict[str, Any] = {"type": "diffuse", "reflectance": COLOURED}
 MATERIALS: dict[str, tuple[dict[str, Any], list[list[float]]]] = {
     "copper": ({"type": "roughconductor", "material": "Cu", "alpha": 0.3, "distribution": "ggx"}, PAINT),
+    "aluminium": ({"type": "roughconductor", "material": "Al", "alpha": 0.4, "distribution": "beckmann"}, PAINT),
     "gold": ({"type": "roughconductor", "material": "Au", "alpha": 0.2, "distribution": "ggx"}, PAINT),
     "lacquer": ({"type": "principled", "base_color": COLOURED, "roughness": 0.35, "specular": 0.8, "clearcoat": 0.6}, PAINT),
     "patina": (

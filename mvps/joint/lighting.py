@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,12 +16,12 @@ from mvps.joint.lights import OfLaw, light_step, subset, told_by_shadows, told_o
 from mvps.joint.observe import ViewSamples, channel_ratio
 from mvps.joint.patches import Patches
 from mvps.joint.reflectance import Observed
-from mvps.joint.state import State
+from mvps.joint.state import State, relative_residuals
 from mvps.joint.steps import Anchor, possible, vertex_step
-from mvps.joint.strengths import as_bright, needed, strengths_in, strengths_of, unknown_in
+from mvps.joint.strengths import Strengths, as_bright, borne_out, needed, strengths_in, strengths_of, unknown_in
 from mvps.memory import room_for, solved_together
 from mvps.mesh import angles_deg, edges, lengths
-from mvps.scene import Capture, Lights, Surface
+from mvps.scene import Capture, Law, Lights, Surface
 
 LIGHT_VERTICES = 4000
 """Vertices, in patches, that stand for all when lights are solved."""
@@ -56,6 +57,21 @@ def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest
     return 1 / (1 + sharpest * (total / count.clamp_min(1)))
 
 
+class _Solved(NamedTuple):
+    """Lights before the last step, lights, law, vertices and strengths after it."""
+
+    before: list[DirectionalLights]
+    lights: list[DirectionalLights]
+    law: Law
+    part: Vertices
+    strengths: Strengths | None
+
+
+def _unexplained(views: list[ViewSamples], vertices: Vertices) -> float:
+    """What is left of the vertices' samples, in the median, as a share of their signal."""
+    return float(relative_residuals(views, vertices).nanmedian())
+
+
 def solved_lights(
     state: State,
     capture: Capture,
@@ -68,7 +84,8 @@ def solved_lights(
     least: float | None,
 ) -> tuple[Lights, float]:
     """The lights solved on the vertices of some patches, which are solved along; mean turn of the directions in the last step, deg.
-    least: of `needed`, by which photographs under one rig get strengths that are solved as well. None: no more than they have.
+    least: of `needed`, by which photographs under one rig get strengths that are solved as well, where these explain what they should.
+    None: no more than they have.
 
     Samples count by how far they are of one normal: along folds that pixels do not resolve, lights would make up for the model's error.
     """
@@ -78,26 +95,36 @@ def solved_lights(
     few, part, tie = subset(few, vertices, replace(anchor, sigma=LIGHT_TIE), patches.vertex)
     rotations = [tensor32(rig_frame(state.lights, view.camera), patches.vertex.device) for view in capture.views]
     lights = grey_lights(state.lights, patches.vertex.device)
-    before, rig, steps = lights, state.lights.one_rig, LIGHT_STEPS
+    rig = state.lights.one_rig
     known = strengths_of(state.lights)
     strengths = None if known is None else strengths_in(lights, unknown_in(known))
-    while steps:
-        steps -= 1
-        before = lights
-        lights, state.law = light_step(few, part, lights, state.law, tie, patches, rotations, rig, free_lights, of_law, strengths)
-        strengths = strengths and strengths_in(lights, strengths.unknown)
-        lights, part = with_mean_one(lights, part)
-        for _ in range(2):
-            part = vertex_step(few, part, lights, state.law, tie, patches=patches)
-        if least is not None and free_lights and rig and not steps:
-            so_far = strengths or as_bright(lights)
-            told = told_of_strengths(few, part, lights, state.law, tie, patches, rotations, of_law, so_far)
-            unknown = needed(told, len(lights[0].intensity), least)
-            if unknown > (strengths.unknown if strengths else 0):
-                # Lights that were solved as if all were as bright are solved again, from farther off than a round's steps begin.
-                strengths, steps = replace(so_far, unknown=unknown), 2 * LIGHT_STEPS
-                state.together = solved_together(state.lights, unknown * len(lights))
-                room_for(len(state.surface.vertices), lights=state.together)
+
+    def stepped(so_far: _Solved, steps: int) -> _Solved:
+        before, lights, law, part, strengths = so_far
+        for _ in range(steps):
+            before = lights
+            lights, law = light_step(few, part, lights, law, tie, patches, rotations, rig, free_lights, of_law, strengths)
+            strengths = strengths and strengths_in(lights, strengths.unknown)
+            lights, part = with_mean_one(lights, part)
+            for _ in range(2):
+                part = vertex_step(few, part, lights, law, tie, patches=patches)
+        return _Solved(before, lights, law, part, strengths)
+
+    found = stepped(_Solved(lights, lights, state.law, part, strengths), LIGHT_STEPS)
+    while least is not None and free_lights and rig:
+        so_far = found.strengths or as_bright(found.lights)
+        told = told_of_strengths(few, found.part, found.lights, found.law, tie, patches, rotations, of_law, so_far)
+        unknown = needed(told, len(found.lights[0].intensity), least)
+        if unknown <= (found.strengths.unknown if found.strengths else 0):
+            break
+        together = solved_together(state.lights, unknown * len(lights))
+        room_for(len(state.surface.vertices), lights=together)
+        # Lights that were solved as if all were as bright are solved again, from farther off than a round's steps begin.
+        trial = stepped(found._replace(strengths=replace(so_far, unknown=unknown)), 2 * LIGHT_STEPS)
+        if not borne_out(told, unknown, *(_unexplained(few, one.part) for one in (found, trial))):
+            break
+        found, state.together = trial, together
+    before, lights, state.law = found.before, found.lights, found.law
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)
     return solved, float(np.concatenate(turned).mean())
