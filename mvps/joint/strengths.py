@@ -11,8 +11,8 @@ with the residual and with itself, the strength of a photograph explains beside 
 
 Of the sum what a tenth of the photographs explains counts as twice what all others do at most, for a black one is no flicker: of a normal
 distribution's squares the largest tenth has 0.44. And strengths of views, whose vertices' albedo makes up for most of them, explain
-g^T S^-1 g / r^2 with them less that without, S the lights' system. They stay unknown where as much is gone once they are solved: what is
-wrong with a badly fitting model looks like photographs that are not as bright, and is not mended by it.
+g^T S^-1 g / r^2 with them less that without, S the lights' system. They stay where half of as much is gone once they are solved: what
+is wrong with a badly fitting model looks like photographs that are not as bright, and is not mended by strengths.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ MOST = 0.22
 (a plane, the hull of a nut), 0.26 to 0.7 under lamps that flicker by 3 % on most hulls (docs/findings/lights.md)."""
 
 GONE = 0.5
-"""Part of what strengths' next step explains that has to be gone once they are solved. Under lamps that did flicker three quarters of it
-were, and more; on metals with flat and round sides, all photographs as bright, at most a fifth, on most more was left than before
+"""Part of what strengths' next step explains that has to be gone once they are solved. Under lamps that did flicker 0.74 of it was, and
+more; on metals with flat and round sides, all photographs as bright, at most a fifth, on most more was left than before
 (docs/findings/lights.md)."""
 
 TENTH = 0.1
@@ -124,6 +124,7 @@ def needed(told: Told, lights: int, least: float) -> int:
 
 
 def borne_out(told: Told, unknown: int, before: float, after: float) -> bool:
-    """Whether strengths, as many `unknown` ones of a view, left as little unexplained as was told; before, after: root mean squares."""
+    """Whether strengths, as many `unknown` ones of a view, took at least GONE of what was told off what is unexplained; before, after:
+    root mean squares."""
     explained = told.photographs if unknown > 1 else told.views
     return after**2 <= before**2 * (1 - GONE * explained)
