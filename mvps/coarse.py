@@ -104,9 +104,9 @@ def in_turn(
     from mvps.joint.refine import MOVING_DEG
     from mvps.material import POOR_FIT
     from mvps.mesh import piece_count
-    from mvps.occupancy import CONTINUED, Occupancy, OccupancySettings
+    from mvps.occupancy import CONTINUED, EASED, Occupancy, OccupancySettings
 
-    plan, refined, carried = OccupancySettings(), rough, None
+    plan, refined, carried = EASED if of_turn.eased else OccupancySettings(), rough, None
     rounds: list[dict[str, float]] = []
     residual = rough.rounds[-1]["residual"]
     field = Occupancy(capture, grid, plan, settings.seed, chosen_device(settings.device), piece_count(rough.surface))
@@ -141,13 +141,17 @@ def coarse(
 ) -> tuple[Refined, list[dict[str, float]]]:
     """Shape, lights and normals for the last rounds to start from, and the rounds that they took, moves in pixels of `used`. Of large
     photographs at half their size, or less; what is found there is pulled to what each larger level but the last shows."""
+    from mvps.joint.thinned import abundant
+    from mvps.material import POOR_FIT
     from mvps.plan import carving_pass, first_pass
 
     sizes = half_sizes(used, progress)
     level = sizes.pop()
     begun, plan = begin(level, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
     rough = step("first refinement", lambda: stage_two("first refinement", level, begun.surface, begun, plan, settings, progress))
-    turns = parts.of(carving_pass(lights is None))
+    # `fine` takes its time for the little that is to be had.
+    eased = settings.preset != "fine" and abundant(level) and rough.rounds[-1]["residual"] <= POOR_FIT
+    turns = parts.of(carving_pass(lights is None, eased))
     found: Refined
     found, rounds = step("shape", lambda: shaped(level, begun.grid, rough, settings, turns, progress))
     rounds = in_pixels(rounds, 2 ** len(sizes))

@@ -105,13 +105,15 @@ def pitted(
     from mvps.hollows import beyond_noise, dug, mean_depth, misfit, pits
     from mvps.hull import visual_hull
     from mvps.mesh import piece_count
-    from mvps.plan import once
+    from mvps.plan import COARSE, once
 
     noise, pixel = samples_noise(capture), surface_pixel(capture, found.surface)
     best, rounds, plan = found, list[dict[str, float]](), once(of_turn)
     left = beyond_noise(best.unexplained, noise)
+    # A single vertex that does not fit is as wide as edges are.
+    least = grid.spacing * max(one.edge for one in of_turn.rounds) / COARSE.edge
     for _ in range(MOST_TURNS):
-        depth = pits(best.surface, left, grid.spacing)
+        depth = pits(best.surface, left, least)
         if mean_depth(best.surface, left, depth) <= PITS * pixel:
             break
         # Ground that was dug is a cell away from the balls at most.

@@ -50,6 +50,9 @@ class OccupancySettings(TrainingSettings):
 CONTINUED = OccupancySettings(steps=100, band=(4.0, 2.0), width=(1.0, 0.5), step=(1.0, 1.0), outlier=(0.5, 0.5), voxel=1.25, strides=(2, 1))
 """For a field that other normal maps have trained already: its surface is off by the last band at most, so all starts where that ended."""
 
+EASED = OccupancySettings(steps=120)
+"""Where photographs abound and the model fits: rounds after it go on as far (docs/findings/stage_one.md)."""
+
 
 def composite(signed_distance: Tensor, width: float) -> tuple[Tensor, Tensor]:
     """Weights (rays, samples) and opacity (rays,) of signed distances (rays, samples) along rays, nearest first."""

@@ -69,10 +69,12 @@ COARSE = RoundSettings(2.0, 2.4, 0.4, still=STILL_PIXELS, carving=True)
 """A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""
 
 
-def carving_pass(free_lights: bool) -> RefineSettings:
+def carving_pass(free_lights: bool, eased: bool = False) -> RefineSettings:
     """What comes after Stage I: lights and normals on its surface, and hollows dug as deep as photographs tell, until vertices lie still
-    where the model fits; where it does not, Stage I has a turn first."""
-    return RefineSettings((COARSE,), free_lights=free_lights, half=True)
+    where the model fits; where it does not, Stage I has a turn first. eased: photographs abound and the model fits, so less of each does
+    (docs/findings/stage_one.md)."""
+    coarse = replace(COARSE, edge=2.5, fusions=2) if eased else COARSE
+    return RefineSettings((coarse,), free_lights=free_lights, half=True, eased=eased)
 
 
 def once(plan: RefineSettings) -> RefineSettings:

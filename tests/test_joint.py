@@ -29,7 +29,7 @@ from mvps.joint.shown import OWN_SHARE
 from mvps.joint.state import State
 from mvps.joint.stated import scatter, stated_errors
 from mvps.joint.steps import LEAST_NOISE, SCALE_FLOOR, _least_scale, free_reflectance, possible, vertex_step, with_population
-from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, thinned
+from mvps.joint.thinned import ENOUGH_LIGHTS, ENOUGH_PHOTOGRAPHS, abundant, thinned
 from mvps.joint.vertices import fuse
 from mvps.material import Model
 from mvps.mesh import face_normals, isotropic_remesh, normalise, vertex_normals
@@ -370,6 +370,17 @@ def test_thinned_views_keep_other_lights_and_their_own_light(scene: SphereScene)
     half = thinned(crowd, Lights((direction,) * 21, (numbered,) * 21, True), fewer=2)[0]
     assert ENOUGH_LIGHTS / 2 <= min(len(v.lights) for v in half.views) <= min(sizes) / 2
     assert {number for v in half.views for number in v.lights} == set(many.lights)
+
+
+@pytest.mark.parametrize(
+    ("views", "lights", "abound"), [(20, 12, True), (20, 96, True), (40, 6, True), (12, 20, False), (5, 96, False), (20, 11, False)]
+)
+def test_photographs_abound_where_many_views_have_as_many_lights_as_tell_a_pixel(views: int, lights: int, abound: bool) -> None:
+    """However many a few views have: they do not show a place from more sides."""
+    view = make_sphere(1).capture.views[0]
+    samples = np.zeros((len(view.pixels), lights, 3), view.samples.dtype)
+    view = replace(view, samples=samples, lights=tuple(range(1, lights + 1)))
+    assert abundant(Capture("many", tuple(replace(view, name=f"view_{k:02d}") for k in range(1, views + 1)))) == abound
 
 
 @pytest.mark.parametrize("fewer", [1.0, 2.0, 100.0])

@@ -74,6 +74,19 @@ def test_one_dark_side_does_not_make_a_mask_too_large() -> None:
     assert not seen(shadowed).off
 
 
+@pytest.mark.parametrize("grown", [0, 4])
+def test_dark_sides_all_around_do_not_make_a_mask_too_large(grown: int) -> None:
+    view = photographed(disc(25 + grown))
+    assert view.frame is not None
+    # Sides with less than a hundredth of the front's light, but more than darkness has.
+    sides = (view.frame > 10) * np.random.default_rng(1).uniform(25, 90, view.frame.shape)
+    frame = np.where(disc(17), view.frame, view.frame % 8 + sides).astype(np.float32)
+    assert threshold(frame, 65535) > 98
+    dark = View("stone", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), frame)
+    assert seen(dark).judged and seen(dark).off == (grown > 0)
+    assert abs(seen(dark).edge + grown) < 0.75
+
+
 def before_wall(mask: Bool, wall: np.ndarray, radius: float = 25.0) -> View:
     """The ball in front of a wall (height, width) as bright as its middle or so."""
     view = photographed(mask, radius)

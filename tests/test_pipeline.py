@@ -21,7 +21,8 @@ from mvps.command import run
 from mvps.export import read_reconstruction
 from mvps.material import POOR_FIT
 from mvps.measures import distance_to
-from mvps.occupancy import CONTINUED, OccupancySettings
+from mvps.occupancy import CONTINUED, EASED, OccupancySettings
+from mvps.plan import Parts, carving_pass
 from mvps.progress import Progress
 from mvps.reconstruct import Settings
 from mvps.synthetic.files import write_capture
@@ -175,10 +176,33 @@ def test_few_lights_say_nothing_of_the_hull(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
     monkeypatch.setattr("mvps.mesh.piece_count", lambda _: 1)
-    of_turn = SimpleNamespace(rounds=[SimpleNamespace(fusions=0)])
+    of_turn = SimpleNamespace(rounds=[SimpleNamespace(fusions=0)], eased=False)
     for lights, surface in ((1, "refined"), (3, "refined"), (4, "hull")):
         capture = SimpleNamespace(views=[SimpleNamespace(lights=tuple(range(lights)))])
         assert shaped(capture, None, rough, Settings("somewhere"), of_turn, Progress())[0].surface == surface  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("preset", "abound", "residual", "eased"),
+    [
+        ("standard", True, 0.02, True),
+        ("standard", False, 0.02, False),
+        ("standard", True, 2 * POOR_FIT, False),
+        ("fine", True, 0.02, False),
+    ],
+)
+def test_rounds_do_less_where_photographs_abound_and_the_model_fits(
+    preset: str, abound: bool, residual: float, eased: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rough = SimpleNamespace(rounds=[{"residual": residual}])
+    begun = SimpleNamespace(surface=None, grid=None)
+    monkeypatch.setattr("mvps.coarse.half_sizes", lambda *_: ["capture"])
+    monkeypatch.setattr("mvps.coarse.begin", lambda *_: begun)
+    monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: rough)
+    monkeypatch.setattr("mvps.joint.thinned.abundant", lambda _: abound)
+    monkeypatch.setattr("mvps.coarse.shaped", lambda *given: (given[4], []))
+    plan, _ = coarse.coarse(None, Settings("somewhere", preset), None, Parts(), Progress(), lambda _, make: make())  # type: ignore[arg-type]
+    assert plan.eased == eased  # type: ignore[attr-defined]
 
 
 def test_held_out_photographs_are_predicted(capture: Path, tmp_path: Path) -> None:
@@ -222,18 +246,19 @@ def test_bunny_in_half_of_its_views_at_a_quarter_of_its_lights(captures: Path, t
 
 
 @pytest.mark.parametrize(
-    ("residuals", "turned_deg", "turns"),
+    ("residuals", "turned_deg", "turns", "eased"),
     [
-        ((0.05,), (0.5,), 1),
-        ((0.2, 0.08), (3, 0.5), 2),
-        ((0.2, 0.15, 0.16), (3, 3, 3), 3),
-        ((0.25, 0.24, 0.23, 0.22, 0.21, 0.2, 0.19), 7 * (0.5,), MOST_TURNS),
-        ((0.05, 0.02, 0.01), (3.4, 1.3, 0.6), 3),
+        ((0.05,), (0.5,), 1, False),
+        ((0.05,), (0.5,), 1, True),
+        ((0.2, 0.08), (3, 0.5), 2, False),
+        ((0.2, 0.15, 0.16), (3, 3, 3), 3, False),
+        ((0.25, 0.24, 0.23, 0.22, 0.21, 0.2, 0.19), 7 * (0.5,), MOST_TURNS, False),
+        ((0.05, 0.02, 0.01), (3.4, 1.3, 0.6), 3, False),
     ],
-    ids=["fits", "comes to fit", "stops falling", "keeps falling", "fits under other lights"],
+    ids=["fits", "photographs abound", "comes to fit", "stops falling", "keeps falling", "fits under other lights"],
 )
 def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
-    residuals: tuple[float, ...], turned_deg: tuple[float, ...], turns: int, monkeypatch: pytest.MonkeyPatch
+    residuals: tuple[float, ...], turned_deg: tuple[float, ...], turns: int, eased: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = iter(zip(residuals, turned_deg, strict=True))
     trained: list[int] = []
@@ -251,6 +276,7 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
     monkeypatch.setattr("mvps.coarse.stage_one", one)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
     monkeypatch.setattr("mvps.mesh.piece_count", lambda _: 1)
-    last, rounds = in_turn(None, None, refined(0.3, 5.0), Settings("somewhere"), None, None, "")  # type: ignore[arg-type]
-    assert trained == [OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
+    plan = carving_pass(True, eased)
+    last, rounds = in_turn(None, None, refined(0.3, 5.0), Settings("somewhere"), plan, None, "")  # type: ignore[arg-type]
+    assert trained == [EASED.steps if eased else OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
     assert [r["residual"] for r in rounds[::2]] == list(residuals[:turns]) and last.rounds[0]["residual"] == residuals[turns - 1]

@@ -76,3 +76,5 @@ def test_budgets_are_methods() -> None:
 def test_coarse_rounds_are_done_again_while_vertices_move() -> None:
     (coarse,) = carving_pass(True).rounds
     assert coarse.carving and 0 < coarse.still < coarse.reach
+    (eased,) = carving_pass(True, eased=True).rounds
+    assert eased.edge > coarse.edge and eased.fusions < coarse.fusions and eased.still == coarse.still

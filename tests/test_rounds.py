@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -60,6 +62,21 @@ def test_a_round_is_done_again_until_vertices_are_still(scene: SphereScene) -> N
     changes, _ = swollen(scene, 0.5, still=0.6 * first)
     assert changes[0] == first and len(changes) == 2 and changes[1] <= 0.6 * first
     assert len(swollen(scene, 0.5, still=1.5 * first)[0]) == 1
+
+
+def test_where_photographs_abound_a_round_that_is_done_again_solves_vertices_alone(scene: SphereScene) -> None:
+    """Lights, law and the views' normals are the first one's, as is what is known of whether they have settled."""
+    once = RefineSettings((RoundSettings(3.0, REACH, 0.4, carving=True),), eased=True)
+    plan = replace(once, rounds=(replace(once.rounds[0], still=0.01),))
+    alone, again = (refined_from(scene, 0.5, one) for one in (once, plan))
+    first, second = again.rounds
+    assert first["light_change_deg"] > 0 == second["light_change_deg"] and first["light_step_deg"] == second["light_step_deg"]
+    assert second["normal_change_deg"] > 0 and second["residual"] != first["residual"]
+    for before, after in zip(alone.lights.direction, again.lights.direction, strict=True):
+        np.testing.assert_array_equal(before, after)
+    for one, other in zip(alone.maps, again.maps, strict=True):
+        np.testing.assert_array_equal(one.normal, other.normal)
+    assert refined_from(scene, 0.5, replace(plan, eased=False)).rounds[1]["light_change_deg"] > 0
 
 
 def test_where_earlier_moves_did_not_go_on_a_round_stays_single(scene: SphereScene) -> None:

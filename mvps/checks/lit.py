@@ -64,6 +64,9 @@ APART = 2.0
 """How many times darker than the threshold a dark background is: the emptiest factor of two reaches down by the root of that, and a heap
 that reaches into it is not apart. (A ball's rim, a fifth as bright as its middle, was taken for a wall of a third.)"""
 
+BLURRED = 2
+"""Pixels around what is lit that may hold its light, by lenses and because they show it in part."""
+
 BLOCK = np.ones((3, 3), bool)
 """Of pixels: no mixed pixels along an edge hold one, so a part that holds one is none of an edge's staircase."""
 
@@ -131,12 +134,22 @@ def lit_part(view: View, distance: NDArray[np.float32]) -> Lit | None:
     """What the photographs of a view show; distance: `steps` of its mask. None where the view's frame is not known."""
     if view.frame is None:
         return None
-    far = distance > REACH
-    least = threshold(view.frame, 1 / view.scale)
+    far, full_scale = distance > REACH, 1 / view.scale
+    least = threshold(view.frame, full_scale)
     if not far.any() or APART * np.median(view.frame[far]) <= least:
+        if _has_dark_sides(view.frame, view.mask, far, least, full_scale):
+            least = threshold(view.frame[view.frame <= least], full_scale)
         return _told_apart(view, distance, view.frame, least, True)
     contrast, scatter = against_wall(view.frame, far)
     return _told_apart(view, distance, contrast, max(NOISE * scatter, DARKEST / view.scale), False)
+
+
+def _has_dark_sides(frame: NDArray[np.float32], mask: Bool, far: Bool, least: float, full_scale: float) -> bool:
+    """Whether what is dark within a mask, farther from what is lit than light is blurred, is brighter than what is far from the mask."""
+    sides = binary_opening(mask & ~binary_dilation(frame > least, BLOCK, BLURRED), BLOCK)
+    if not (sides.any() and far.any()):
+        return False
+    return bool(np.median(frame[sides]) > APART * np.quantile(frame[far], 1 - FEW) + DARKEST * full_scale)
 
 
 def against_wall(frame: NDArray[np.float32], far: Bool) -> tuple[NDArray[np.float32], float]:

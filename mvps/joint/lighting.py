@@ -26,6 +26,9 @@ from mvps.scene import Capture, Law, Lights, Surface
 LIGHT_VERTICES = 4000
 """Vertices, in patches, that stand for all when lights are solved."""
 
+FEWER_VERTICES = 2000
+"""The same on the way, under photographs that abound."""
+
 LIGHT_STEPS = 3
 """Gauss-Newton steps a round: near a minimum steps at least halve (refine.py)."""
 

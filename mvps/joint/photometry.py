@@ -14,13 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from mvps.cores import neighbours
 from mvps.joint.blocks import Vertices
 from mvps.joint.choosing import count_lobes, of_chosen_model
 from mvps.joint.fused import vertex_maps
 from mvps.joint.grey import grey_lights, tensor32
-from mvps.joint.lighting import LIGHT_TIE, LIGHT_VERTICES, solved_lights, with_bounce, with_colours
+from mvps.joint.lighting import FEWER_VERTICES, LIGHT_TIE, LIGHT_VERTICES, solved_lights, with_bounce, with_colours
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import all_pixel_normals
@@ -41,14 +42,15 @@ WEAK_TIE = 0.3
 @dataclass(frozen=True)
 class Task:
     """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; sharpen: and solve the lobes'
-    sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device:
-    of the tensors."""
+    sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; eased:
+    lights are solved on fewer vertices; device: of the tensors."""
 
     free_lights: bool
     choose: bool
     sharpen: bool
     thinned: bool
     half: bool
+    eased: bool
     device: torch.device
 
 
@@ -95,23 +97,76 @@ def _least(state: State, vertices: Vertices, first: bool, last: bool) -> float |
     return None if last else SOME
 
 
-def photometric_round(
-    state: State, capture: Capture, task: Task, carried: tuple[Surface, Vertices] | None, generator: np.random.Generator
-) -> dict[str, float]:
-    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed. First lights do not count as moving."""
-    device = task.device
-    part, part_lights = thinned(capture, state.lights)
+def _seen_anew(
+    state: State, capture: Capture, carried: tuple[Surface, Vertices] | None, device: torch.device
+) -> tuple[tuple[Capture, Lights], Vertices, NDArray[Any]]:
+    """The part of the capture that tells vertices, with its lights, of which the state gets its samples on its mesh; its vertices to begin
+    with; those that are seen."""
+    part, lights = thinned(capture, state.lights)
     state.gathers = {}
-    state.views = observe(part, state.surface, part_lights, device, shadows=state.law.shadows)
-    mesh_normal = vertex_normals(state.surface)
-    vertices = _started(state, part, part_lights, mesh_normal, carried, device)
+    state.views = observe(part, state.surface, lights, device, shadows=state.law.shadows)
+    vertices = _started(state, part, lights, vertex_normals(state.surface), carried, device)
     seen = torch.cat([samples.vertex for samples in state.views]).unique().cpu().numpy()
     if not len(seen):
         raise CaptureError(
             f"{capture.name}: wanted a view that sees the object a pixel inside of its mask, given none; photograph thin objects from"
             " nearer, and check masks and poses"
         )
-    patches = drawn_patches(seen, state.surface, mesh_normal, LIGHT_VERTICES, generator, device)
+    return (part, lights), vertices, seen
+
+
+def _told(state: State, before: Tensor, last: Tensor, seen: NDArray[Any]) -> dict[str, float]:
+    """What a round came to: of the vertices that are seen, whose normals (V, 3) were `before`, and `last` before the last step."""
+    vertices = state.vertices
+    assert vertices is not None and vertices.sigma is not None
+    turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
+    stated = np.degrees(vertices.sigma.cpu().numpy()[seen]).clip(max=90.0)  # infinite where no sample counts, which may be most
+    return {
+        "residual": float(relative_residuals(state.views, vertices).nanmedian()),
+        "normal_change_deg": float(np.mean(turned)),
+        "last_step_deg": float(np.median(settling)),
+        "stated_error_deg": float(np.median(stated)),
+        "grazing": state.law.grazing,
+        "bounce": state.law.bounce,
+        "gleam": state.law.gleam,
+    }
+
+
+def _vertices_again(
+    state: State, capture: Capture, carried: tuple[Surface, Vertices] | None, device: torch.device, before: dict[str, float]
+) -> dict[str, float]:
+    """Vertices on the state's mesh, which a round just moved by little: lights, law and the views' normals stay. What changed; before: in
+    that round."""
+    under, vertices, seen = _seen_anew(state, capture, carried, device)
+    lights = grey_lights(under[1], device)
+    free = free_reflectance(tensor32(vertex_normals(state.surface), device), WEAK_TIE, 1 + len(state.law.sharpness))
+    start = vertices.normal
+    state.views = lit_by(state, state.views, *under, senders_of(state, vertices))
+    vertices = vertex_steps(state.views, vertices, lights, state.law, free, CARRIED_STEPS)
+    last, free = vertices.normal, with_population(vertices, free)
+    state.vertices = possible(vertex_step(state.views, vertices, lights, state.law, free), state.law)
+    state.under = under
+    # Whether lights have settled is what that round's last step says.
+    settled = {name: before[name] for name in ("lights_moving_deg", "light_step_deg")}
+    return {**_told(state, start, last, seen), **settled, "light_change_deg": 0.0, "intensity_change": 0.0}
+
+
+def photometric_round(
+    state: State,
+    capture: Capture,
+    task: Task,
+    carried: tuple[Surface, Vertices] | None,
+    generator: np.random.Generator,
+    again: dict[str, float] | None = None,
+) -> dict[str, float]:
+    """Vertices, lights and the views' photometric stereo on the state's mesh; what changed. First lights do not count as moving. again:
+    what the same changed on this mesh, before it was moved a little; then vertices alone are solved."""
+    device, mesh_normal = task.device, vertex_normals(state.surface)
+    if again is not None:
+        return _vertices_again(state, capture, carried, device, again)
+    (part, part_lights), vertices, seen = _seen_anew(state, capture, carried, device)
+    some = FEWER_VERTICES if task.eased else LIGHT_VERTICES
+    patches = drawn_patches(seen, state.surface, mesh_normal, some, generator, device)
     few = state.views
     if part is not capture:
         among = np.zeros(len(mesh_normal), bool)
@@ -150,19 +205,10 @@ def photometric_round(
     of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))
     state.maps = all_pixel_normals(of_pixels, state.surface, material, their_lights, senders_of(state, vertices), device, task.half)
-    turned, settling = (angles_deg(n.cpu().numpy()[seen], vertices.normal.cpu().numpy()[seen]) for n in (before, last))
-    assert vertices.sigma is not None
-    stated = np.degrees(vertices.sigma.cpu().numpy()[seen]).clip(max=90.0)  # infinite where no sample counts, which may be most
     return {
-        "residual": float(relative_residuals(state.views, vertices).nanmedian()),
+        **_told(state, before, last, seen),
         "light_change_deg": moved[0],
         "lights_moving_deg": 0.0 if carried is None else moved[0],
         "intensity_change": moved[1],
-        "normal_change_deg": float(np.mean(turned)),
         "light_step_deg": light_step,
-        "last_step_deg": float(np.median(settling)),
-        "stated_error_deg": float(np.median(stated)),
-        "grazing": state.law.grazing,
-        "bounce": state.law.bounce,
-        "gleam": state.law.gleam,
     }

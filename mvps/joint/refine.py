@@ -112,8 +112,9 @@ class RefineSettings:
     held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
     last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
     the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels and more, or for
-    Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last round's (detail.py); goes_on:
-    how far earlier rounds' moves did (onward.py); model: all that the reflectance may have."""
+    Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last round's (detail.py); eased:
+    lights are solved on fewer vertices, and stay, like the pixels' normals, where a round is done again; goes_on: how far earlier rounds'
+    moves did (onward.py); model: all that the reflectance may have."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
@@ -122,6 +123,7 @@ class RefineSettings:
     for_field: bool = False
     half: bool = False
     detail: bool = False
+    eased: bool = False
     goes_on: float = MOST_GOES_ON
     model: Model = LARGEST
 
@@ -261,8 +263,9 @@ def refine(
         leaves_surface = (settings.for_field and not pending) or not round_settings.fusions
         if round_settings.photometric:
             every_light = settings.in_full and not pending
-            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device)
-            changes = photometric_round(state, capture, task, carried, generator)
+            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, settings.eased, device)
+            on_mesh = account[-1] if isinstance(last, Moves) and settings.eased else None
+            changes = photometric_round(state, capture, task, carried, generator, on_mesh)
             seen = [s.vertex.cpu().numpy() for s in state.views]
         else:
             seen, changes = [index for index, _ in visible_in(capture, state.surface)], {}

@@ -26,6 +26,12 @@ def kept(counts: Sequence[int], fewer: int = 1) -> list[slice]:
     return [slice(i % k, None, k) for i, k in enumerate(steps)]
 
 
+def abundant(capture: Capture) -> bool:
+    """Whether the views have ENOUGH_PHOTOGRAPHS of which none shows what ENOUGH_LIGHTS others of its view do: every place is then seen from
+    many sides under many lights."""
+    return sum(min(len(view.lights), ENOUGH_LIGHTS) for view in capture.views) >= ENOUGH_PHOTOGRAPHS
+
+
 _parts: WeakKeyDictionary[Capture, dict[int, Capture]] = WeakKeyDictionary()
 
 
