@@ -116,9 +116,7 @@ def refine_view(
             attempt = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
         else:
             attempt = replace(state, surface=surface, lights=lights, maps=(maps,))
-        changes = photometric_round(
-            attempt, capture, Task(settings.free_lights, False, False, False, False, False, device), None, generator
-        )
+        changes = photometric_round(attempt, capture, Task(settings.free_lights, False, False, False, False, device), None, generator)
         if changes["residual"] > WORSE * min((before["residual"] for before in account), default=np.inf):
             break
         state, start = attempt, following

@@ -42,16 +42,16 @@ WEAK_TIE = 0.3
 @dataclass(frozen=True)
 class Task:
     """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; sharpen: and solve the lobes'
-    sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; eased:
-    lights are solved on fewer vertices; device: of the tensors."""
+    sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device:
+    of the tensors; eased: lights are solved on fewer vertices."""
 
     free_lights: bool
     choose: bool
     sharpen: bool
     thinned: bool
     half: bool
-    eased: bool
     device: torch.device
+    eased: bool = False
 
 
 def _started(

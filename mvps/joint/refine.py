@@ -263,7 +263,7 @@ def refine(
         leaves_surface = (settings.for_field and not pending) or not round_settings.fusions
         if round_settings.photometric:
             every_light = settings.in_full and not pending
-            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, settings.eased, device)
+            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device, settings.eased)
             on_mesh = account[-1] if isinstance(last, Moves) and settings.eased else None
             changes = photometric_round(state, capture, task, carried, generator, on_mesh)
             seen = [s.vertex.cpu().numpy() for s in state.views]
