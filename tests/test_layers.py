@@ -95,7 +95,8 @@ def test_parts_of_a_picture_join(scene: SphereScene, caster: RayCaster, monkeypa
     parts, also = rendered(caster, scene.reconstruction.material, CAMERA, sky.with_also(point), LAYERS)
     np.testing.assert_array_equal(also, coverage)
     for name, values in whole.items():
-        np.testing.assert_array_equal(parts[name], values)
+        # A processor's wide registers add the rest of an array in another order.
+        np.testing.assert_allclose(parts[name], values, rtol=1e-6)
     # Rays on their way at a time: what memory grows with.
     assert len(largest) == 3 and max(largest) == 4000
 
