@@ -306,7 +306,7 @@ def test_an_interrupted_run(capture: Path, tmp_path: Path, stage: str, number: s
         time.sleep(0.1)
         process.send_signal(number)
         rest = process.stderr.read().splitlines()
-        assert process.wait(timeout=60) == 128 + number
+        assert process.wait(timeout=60) == 128 + number, rest
     assert rest[-1] == "mvps: interrupted before the end" and not any("Traceback" in line for line in rest)
     assert not [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
     assert not out.exists() or [path.name for path in out.iterdir()] == ["checkpoint"]
