@@ -211,13 +211,6 @@ def gathered(sources: Sources, lit: NDArray[np.float32], bounce: float) -> NDArr
     return np.stack([of_channel(channel) for channel in sources.albedo.T], -1)
 
 
-def at(sources: Sources, G: NDArray[np.float32], points: Float, normal: Float) -> NDArray[np.float32]:
-    """G (n, ...) interpolated at points with normals (points, 3)."""
-    weight = interpolation(sources.of, points, normal)
-    values: NDArray[np.float32] = (weight @ G.reshape(len(G), -1)).reshape(len(points), *G.shape[1:])
-    return values
-
-
 def interpolation(of: Gather, points: Float, normal: Float) -> sp.csr_matrix:
     """(points, n) weights of the patches at points with normals (points, 3): inverse squared distance, facing the same way."""
     distance, index = neighbours(of.tree, points, NEIGHBOURS)

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -39,13 +40,14 @@ from mvps.bounce import (
     Sources,
     gather,
     gathered,
+    interpolation,
     lit_by,
     lit_by_points,
     series,
     sources_on,
 )
 from mvps.mesh import mean_edge_length, normalise
-from mvps.scene import Float, Law, Material, Surface
+from mvps.scene import Float, Int, Law, Material, Surface
 from mvps.shading import PARALLEL, gain_of, lobe_of, returned
 
 LEAST_SHARE = 0.25
@@ -107,90 +109,144 @@ def coarse_senders(surface: Surface, material: Material, grey: bool = False) -> 
     return senders(of, surface, material.law, albedo, weight if material.gleam else None)
 
 
-def terms(of: Senders, direction: Float, eye: Float) -> Single:
-    """G (n, lights, 1 or 2 + lobes) on the patches, or (n, lights, 1 or 2 + lobes, channels), under lights direction (lights, 3), seen from
-    a camera at eye (3,). One term where lobes take no part."""
-    return _terms(of, direction, lit_by(of.sources.of, direction), eye)
+class Terms:
+    """G on the patches under some lights, seen from an eye: (n, lights, 1 or 2 + lobes), or (n, lights, 1 or 2 + lobes, channels); one term
+    where lobes take no part.
+
+    What lobes do is worked out patch by patch, when one is asked for: a camera sees a part of them. For one thread at a time.
+    """
+
+    def __init__(self, of: Senders, direction: Float, lit: Single, eye: Float) -> None:
+        """direction (lights, 3), or (n, lights, 3) of every patch; lit (n, lights)."""
+        self._net = of.sources.of
+        diffuse = gathered(of.sources, lit, of.law.bounce)
+        self._lobes = None if of.weight is None else _lobes_under(of, direction, lit, eye)
+        if self._lobes is None:
+            self._G = np.expand_dims(diffuse, 2)
+            return
+        coloured, terms = of.sources.albedo.ndim == 2, 2 + len(of.law.sharpness)
+        self._G = np.zeros((*lit.shape, terms, 3) if coloured else (*lit.shape, terms), np.float32)
+        self._G[:, :, 0] = diffuse
+        self._known = np.zeros(len(lit), bool)
+
+    def on(self, patches: Int) -> Single:
+        """On some patches (m,): (m, lights, ...)."""
+        self._work_out(patches)
+        return self._G[patches]
+
+    def through(self, weight: sp.csr_matrix, lights: slice = slice(None)) -> Single:
+        """(points, lights, ...) of some of the lights, interpolated with weights (points, n)."""
+        self._work_out(weight.indices)
+        G = self._G[:, lights]
+        values: Single = weight @ G.reshape(len(G), -1)
+        return values.reshape(-1, *G.shape[1:])
+
+    def at(self, points: Float, normal: Float, lights: slice = slice(None)) -> Single:
+        """(points, lights, ...) of some of the lights, interpolated at points with normals (points, 3)."""
+        return self.through(interpolation(self._net, points, normal), lights)
+
+    def _work_out(self, patches: NDArray[Any]) -> None:
+        if self._lobes is None:
+            return
+        asked = np.zeros_like(self._known)
+        asked[patches] = True
+        asked &= ~self._known & (np.diff(self._net.start) > 0)
+        self._known |= asked
+        new = np.flatnonzero(asked)
+        for some in _parts(self._net, new, self._G.shape[1]):
+            means = _means(self._lobes, some)
+            self._G[some, :, 1:] = means if self._G.ndim == 4 else means[..., 0]
+            self._G[some, :, 1] -= self._G[some, :, 0]
 
 
-def terms_of_points(of: Senders, position: Float, eye: Float) -> Single:
+def terms(of: Senders, direction: Float, eye: Float) -> Terms:
+    """Under lights direction (lights, 3), seen from a camera at eye (3,)."""
+    return Terms(of, direction, lit_by(of.sources.of, direction), eye)
+
+
+def terms_of_points(of: Senders, position: Float, eye: Float) -> Terms:
     """The same under points of light, position (points, 3), over their strength (illumination.py) in place of the lights' intensity."""
-    return _terms(of, *lit_by_points(of.sources.of, position), eye)
+    return Terms(of, *lit_by_points(of.sources.of, position), eye)
 
 
-def _terms(of: Senders, direction: Float, lit: Single, eye: Float) -> Single:
-    """direction (lights, 3), or (n, lights, 3) of every patch; lit (n, lights)."""
-    if of.weight is None:
-        return np.expand_dims(gathered(of.sources, lit, of.law.bounce), 2)
+class _Lobes(NamedTuple):
+    """Lobes of n patches under lights, seen from an eye: spread (n,) of their normals, normal, view (n, 3); light (lights, 3), or
+    (n, lights, 3); lit (n, lights). Channels first: albedo (channels, n), weight (channels, lobes, n), later (channels, n, lights), what
+    the header calls R A."""
+
+    net: Gather
+    law: Law
+    spread: Single
+    normal: Single
+    view: Single
+    light: Single
+    lit: Single
+    albedo: Single
+    weight: Single
+    later: Single
+
+
+def _lobes_under(of: Senders, direction: Float, lit: Single, eye: Float) -> _Lobes:
+    """direction, lit as in `Terms`."""
+    assert of.weight is not None
     net, law, albedo = of.sources.of, of.law, of.sources.albedo
-    coloured = albedo.ndim == 2
-    a = (albedo if coloured else albedo[:, None]).astype(np.float32)
-    w = of.weight if of.weight.ndim == 3 else of.weight[..., None]
-    w = np.broadcast_to(w, (*w.shape[:2], a.shape[1])).astype(np.float32)
-    later = _later(net, law, a, w, lit)
-    G = np.zeros((*lit.shape, 2 + w.shape[1], a.shape[1]), np.float32)
-    diffuse = gathered(of.sources, lit, law.bounce)
-    G[:, :, 0] = diffuse if coloured else diffuse[..., None]
-    for patches, rays in _parts(net, lit.shape[1]):
-        sent, taken = _sent(net, law, a, w, lit, later, direction, rays), _taken(net, law, eye, rays)
-        starts = net.start[patches.start : patches.stop + 1] - rays.start
-        for k, share in enumerate(taken):
-            mean = sp.csr_matrix((share / RAYS, np.arange(len(share)), starts), (len(starts) - 1, len(share)))
-            G[patches, :, 1 + k] = (mean @ sent.reshape(len(sent), G[0, :, 0].size)).reshape(-1, *sent.shape[1:])
-    G[:, :, 1] -= G[:, :, 0]
-    return G if coloured else G[..., 0]
+    a = np.ascontiguousarray((albedo if albedo.ndim == 2 else albedo[:, None]).T, np.float32)
+    of_channels = of.weight if of.weight.ndim == 3 else np.broadcast_to(of.weight[..., None], (*of.weight.shape, len(a)))
+    w = np.ascontiguousarray(of_channels.T, np.float32)
+    of_all = returned(law.sharpness, law.microfacet)[1:, None].astype(np.float32)
+    later = []
+    for of_albedo, by_lobes in zip(a, (w * of_all).sum(1), strict=True):
+        again = (law.bounce * of_albedo + law.gleam * by_lobes)[:, None]
+        later.append(again * series(net.S, lit * (of_albedo + by_lobes)[:, None], again, BOUNCES - 1))
+    spread, normal, view, light = (x.astype(np.float32) for x in (net.spread, net.normal, normalise(eye - net.tree.data), direction))
+    return _Lobes(net, law, spread, normal, view, light, lit, a, w, np.stack(later))
 
 
-def _later(net: Gather, law: Law, a: Single, w: Single, lit: Single) -> Single:
-    """R A (n, lights, channels)."""
-    of_lobes = (w * returned(law.sharpness, law.microfacet)[1:, None].astype(np.float32)).sum(1)
-    again = (law.bounce * a + law.gleam * of_lobes).astype(np.float32)
-    first = (a + of_lobes).T[..., None]
-    arriving = [series(net.S, lit * direct, R[:, None], BOUNCES - 1) for direct, R in zip(first, again.T, strict=True)]
-    later: Single = again[:, None] * np.stack(arriving, -1)
-    return later
+def _parts(net: Gather, patches: Int, lights: int) -> Iterator[Int]:
+    """Those of patches (m,) that are handled at once."""
+    rays = np.cumsum(net.start[patches + 1] - net.start[patches]) * lights
+    return (some for some in np.split(patches, np.flatnonzero(np.diff(rays // SAMPLES_PER_CHUNK)) + 1) if len(some))
 
 
-def _parts(net: Gather, lights: int) -> Iterator[tuple[slice, slice]]:
-    """Patches, and their rays, that are handled at once."""
-    first, count = 0, len(net.normal)
-    while first < count:
-        most = net.start[first] + max(1, SAMPLES_PER_CHUNK // lights)
-        last = min(max(int(np.searchsorted(net.start, most, side="right")) - 1, first + 1), count)
-        yield slice(first, last), slice(int(net.start[first]), int(net.start[last]))
-        first = last
+def _means(of: _Lobes, patches: Int) -> Single:
+    """(m, lights, 1 + lobes, channels) means of L, and of f_k(v, w) L, over the rays of patches (m,)."""
+    first, count = of.net.start[patches], of.net.start[patches + 1] - of.net.start[patches]
+    ends = np.concatenate([[0], np.cumsum(count)])
+    rays = np.arange(ends[-1]) + np.repeat(first - ends[:-1], count)
+    sent, taken = _sent(of, rays), _taken(of, rays)
+    shape = (len(patches), len(rays))
+    means = [sp.csr_matrix((share / RAYS, np.arange(len(rays)), ends), shape) for share in taken]
+    return np.stack([np.stack([mean @ channel for mean in means], -1) for channel in sent], -1)
 
 
-def _lobes(law: Law, spread: Float, along: Single, summed_length: Single) -> list[Single]:
-    """f_k (rays, ...) for n . (v + w) and |v + w| (rays, ...) at patches with a spread (rays,) of normals."""
-    h_dot_n = np.clip(along / summed_length, -1, 1)
-    gained = gain_of(summed_length)
-    variance: Single = spread.astype(np.float32).reshape(-1, *(1,) * (along.ndim - 1))
-    duller: list[Single] = [(1 + np.float32(s) * variance) ** np.float32(-1) for s in law.sharpness]
-    return [lobe_of(h_dot_n, np.float32(s) * d, law.microfacet) * gained * d for s, d in zip(law.sharpness, duller, strict=True)]
+def _values(of: _Lobes, patch: Int, along: Single, summed_length: Single) -> list[Single]:
+    """f_k (..., rays) for n . (v + w) and |v + w| (..., rays) at the rays' patches (rays,)."""
+    h_dot_n, gained = np.clip(along / summed_length, -1, 1), gain_of(summed_length)
+    spread = of.spread[patch]
+    duller: list[Single] = [(1 + np.float32(s) * spread) ** np.float32(-1) for s in of.law.sharpness]
+    return [lobe_of(h_dot_n, np.float32(s) * d, of.law.microfacet) * gained * d for s, d in zip(of.law.sharpness, duller, strict=True)]
 
 
-def _sent(net: Gather, law: Law, a: Single, w: Single, lit: Single, later: Single, direction: Float, rays: slice) -> Single:
-    """L (rays, lights, channels)."""
-    column, along = net.column[rays], net.along[rays]
-    normal, light = net.normal.astype(np.float32), direction.astype(np.float32)
-    if light.ndim == 2:
-        of_ray, of_normal = along @ light.T, (normal @ light.T)[column]
+def _sent(of: _Lobes, rays: Int) -> Iterator[Single]:
+    """L (rays, lights) of some rays (rays,), channel by channel."""
+    patch, along = of.net.column[rays], of.net.along[rays]
+    normal = of.normal[patch]
+    # Lights first: what rays have of their own then lies along numpy's long axis.
+    if of.light.ndim == 2:
+        of_ray, towards = of.light @ along.T, of.light @ normal.T
     else:
-        of_ray, of_normal = (np.einsum("ri,rli->rl", vectors, light[column]) for vectors in (along, normal[column]))
-    length = np.sqrt(np.maximum(2 - 2 * of_ray, PARALLEL))
-    towards = of_normal - np.einsum("ri,ri->r", normal[column], along)[:, None]
-    sent = np.broadcast_to(a[column, None], (*length.shape, a.shape[1])).copy()
-    for k, value in enumerate(_lobes(law, net.spread[column], towards, length)):
-        sent += value[..., None] * w[column, k][:, None]
-    sent *= lit[column][..., None]
-    sent += later[column]
-    return sent
+        of_ray, towards = (np.einsum("ri,rli->lr", vectors, of.light[patch]) for vectors in (along, normal))
+    towards -= np.einsum("ri,ri->r", normal, along)
+    values = _values(of, patch, towards, np.sqrt(np.maximum(2 - 2 * of_ray, PARALLEL)))
+    lit = of.lit[patch]
+    for albedo, weight, later in zip(of.albedo, of.weight, of.later, strict=True):
+        sent = sum((value * w for value, w in zip(values, weight[:, patch], strict=True)), start=albedo[patch])
+        yield np.ascontiguousarray(sent.T) * lit + later[patch]
 
 
-def _taken(net: Gather, law: Law, eye: Float, rays: slice) -> list[Single]:
-    """1 and f_k(v, w) of the rays (rays,), by which their patch returns them to the eye."""
-    row, along = net.row[rays], net.along[rays]
-    normal, view = (v.astype(np.float32)[row] for v in (net.normal, normalise(eye - net.tree.data)))
+def _taken(of: _Lobes, rays: Int) -> list[Single]:
+    """1 and f_k(v, w) of some rays (rays,), by which their patch returns them to the eye."""
+    patch, along = of.net.row[rays], of.net.along[rays]
+    normal, view = of.normal[patch], of.view[patch]
     length = np.sqrt(np.maximum(2 + 2 * np.einsum("ri,ri->r", view, along), PARALLEL))
-    return [np.ones(len(row), np.float32), *_lobes(law, net.spread[row], np.einsum("ri,ri->r", normal, view + along), length)]
+    return [np.ones(len(patch), np.float32), *_values(of, patch, np.einsum("ri,ri->r", normal, view + along), length)]

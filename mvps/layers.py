@@ -186,7 +186,7 @@ def _sent(arriving: Arriving | None, points: Points, strength: Float, share: sli
     """(n, 3) radiance that points return of what other surfaces send them, under a share of the lights, of this strength (lights, 3)."""
     if arriving is None:
         return np.zeros_like(points.albedo)
-    of_albedo, of_lobes = arriving._replace(G=arriving.G[:, share]).at(points)
+    of_albedo, of_lobes = arriving.at(points, share)
     sent: Float = np.einsum("nlc,lc->nc", points.albedo[:, None] * of_albedo + of_lobes, strength)
     return sent
 

@@ -18,9 +18,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvps.bounce import at
 from mvps.camera import view_directions
-from mvps.gleam import Senders, coarse_senders, terms, terms_of_points
+from mvps.gleam import Senders, Terms, coarse_senders, terms, terms_of_points
 from mvps.mesh import normalise
 from mvps.neural import factor
 from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
@@ -82,15 +81,15 @@ def shadow_at(caster: RayCaster, law: Law, points: Points, lights: Float) -> Boo
 
 
 class Arriving(NamedTuple):
-    """Light that other surfaces send (gleam.py) under some lights, towards one camera: the senders, and G (n, lights, terms, 3) on them."""
+    """Light that other surfaces send (gleam.py), whose law it is, under some lights, towards one camera."""
 
-    senders: Senders
-    G: NDArray[np.float32]
+    law: Law
+    sent: Terms
 
-    def at(self, points: Points) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Per unit intensity (points, lights, 3) each: what a unit of albedo returns, and what the points' lobes do."""
-        law = self.senders.law
-        G = at(self.senders.sources, self.G, points.position, points.mesh_normal)
+    def at(self, points: Points, lights: slice = slice(None)) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Per unit intensity (points, lights, 3) each, of some of the lights: what a unit of albedo returns, and what the points' lobes
+        do."""
+        law, G = self.law, self.sent.at(points.position, points.mesh_normal, lights)
         of_albedo = np.float32(law.bounce) * G[:, :, 0]
         if G.shape[2] == 1:
             return of_albedo, np.zeros_like(of_albedo)
@@ -109,12 +108,12 @@ def light_senders(surface: Surface, material: Material) -> Senders | None:
 
 def light_arriving(senders: Senders | None, direction: Float, eye: Float) -> Arriving | None:
     """What arrives from senders under lights direction (lights, 3), for a camera at eye (3,)."""
-    return None if senders is None else Arriving(senders, terms(senders, direction, eye))
+    return None if senders is None else Arriving(senders.law, terms(senders, direction, eye))
 
 
 def light_arriving_of_points(senders: Senders | None, position: Float, eye: Float) -> Arriving | None:
     """What arrives from senders under points of light, position (points, 3), per unit of their strength (illumination.py)."""
-    return None if senders is None else Arriving(senders, terms_of_points(senders, position, eye))
+    return None if senders is None else Arriving(senders.law, terms_of_points(senders, position, eye))
 
 
 def diffuse_shading(normal: Float, towards: Float, direction: Float, grazing: float) -> NDArray[np.float32]:

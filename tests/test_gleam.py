@@ -72,6 +72,15 @@ def looking_at_origin() -> Camera:
     return Camera(np.array([[150.0, 0, 32], [0, 150, 32], [0, 0, 1]]), rotation, -rotation @ EYE, 64, 64)
 
 
+def every_patch(sent: Senders) -> Int:
+    return np.arange(len(sent.sources.of.normal))
+
+
+def on_all(sent: Senders) -> NDArray[np.float32]:
+    """G on all patches."""
+    return terms(sent, LIGHTS, EYE).on(every_patch(sent))
+
+
 @pytest.fixture
 def ungained(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Lobes without what microfacets gain where light and view part."""
@@ -95,7 +104,7 @@ def test_a_lobe_as_wide_as_the_hemisphere_sends_and_takes_what_a_diffuse_surface
     diffuse = coarse_senders(surface, made_of(surface, 0.5, (), (), bounce=0.8), grey=True)
     lobed = coarse_senders(surface, made_of(surface, 0.0, (0.5,), (WIDE,), gleam=0.8), grey=True)
     assert diffuse is not None and lobed is not None
-    G, by_lobes = terms(diffuse, LIGHTS, EYE), terms(lobed, LIGHTS, EYE)
+    G, by_lobes = on_all(diffuse), on_all(lobed)
     assert G.shape[2] == 1 and by_lobes.shape[2] == 3 and G.max() > 0.05
     assert np.abs(by_lobes[:, :, 0]).max() == 0
     for k in (1, 2):
@@ -109,7 +118,7 @@ def test_albedo_and_lobes_share_what_is_sent() -> None:
     whole = coarse_senders(surface, made_of(surface, 0.5, (), (), bounce=0.8), grey=True)
     halves = coarse_senders(surface, made_of(surface, 0.25, (0.25,), (WIDE,), bounce=0.8, gleam=0.8), grey=True)
     assert whole is not None and halves is not None
-    G, parts = terms(whole, LIGHTS, EYE)[:, :, 0], terms(halves, LIGHTS, EYE)
+    G, parts = on_all(whole)[:, :, 0], on_all(halves)
     assert np.allclose(parts[:, :, 0] + parts[:, :, 1], G, atol=1e-5) and np.allclose(parts[:, :, 2], G, atol=1e-5)
     assert np.allclose(parts[:, :, 0], gathered(halves.sources, lit_by(halves.sources.of, LIGHTS), 0.8))
 
@@ -134,7 +143,21 @@ def test_a_body_without_hollows_sends_itself_nothing() -> None:
     surface = Surface(np.array(made.vertices), np.array(made.faces))
     sent = coarse_senders(surface, made_of(surface, 0.1, (0.5, 0.3), (10.0, 90.0), bounce=1.0, gleam=1.0))
     assert sent is not None
-    assert np.abs(terms(sent, LIGHTS, EYE)).max() == 0
+    assert np.abs(on_all(sent)).max() == 0
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_patches_that_are_asked_for_one_after_the_other_get_what_they_do_together(channels: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    surface = corner()
+    sent = coarse_senders(surface, made_of(surface, 0.3, (0.5, 0.2), (10.0, 60.0), bounce=0.7, gleam=0.9), grey=channels == 1)
+    assert sent is not None
+    together, generator = on_all(sent), np.random.default_rng(0)
+    assert together.shape[3:] == ((3,) if channels == 3 else ()) and together[:, :, 2:].max() > 0
+    monkeypatch.setattr("mvps.gleam.SAMPLES_PER_CHUNK", 500)
+    one_by_one = terms(sent, LIGHTS, EYE)
+    for some in np.array_split(generator.permutation(every_patch(sent)), 5):
+        assert np.array_equal(one_by_one.on(some), together[some])
+    assert np.array_equal(one_by_one.on(every_patch(sent)), together)
 
 
 def test_sharp_lobes_send_to_the_mirror_direction() -> None:
@@ -146,7 +169,7 @@ def test_sharp_lobes_send_to_the_mirror_direction() -> None:
     wall = (of.normal[:, 0] > 0.9) & (of.caster.surface.vertices[of.vertex, 2] > 2)
     # Along the wall's own plane and away from the wall: neither lights the wall itself.
     lights = np.array([[1.0, 0, 1], [-1e-3, 0, 1]]) / np.sqrt([[2.0], [1.0]])
-    G = terms(sent, lights, EYE)[wall, :, 1]
+    G = terms(sent, lights, EYE).on(np.flatnonzero(wall))[:, :, 1]
     assert G[:, 0].mean() > 3 * G[:, 1].mean() > 0
 
 
@@ -157,7 +180,7 @@ def test_the_gain_at_grazing_angles_is_bounded() -> None:
     sent = coarse_senders(surface, material, grey=True)
     plain = coarse_senders(surface, made_of(surface, 1.0, (), (), bounce=1e-9), grey=True)
     assert sent is not None and plain is not None
-    once, twice = terms(sent, LIGHTS, EYE)[:, :, 1], terms(plain, LIGHTS, EYE)[:, :, 0]
+    once, twice = on_all(sent)[:, :, 1], on_all(plain)[:, :, 0]
     once, twice = once[twice > 0.01], twice[twice > 0.01]
     assert (once >= 0.999 * twice).all() and (once <= 1.001 * STEEPEST * twice).all() and once.mean() > 1.2 * twice.mean()
 
@@ -168,10 +191,11 @@ def test_far_points_of_light_send_on_what_lights_do_and_near_ones_fall_off(gleam
     sent = coarse_senders(surface, made_of(surface, 0.4, (0.5,), (20.0,), bounce=0.9, gleam=gleam), grey=True)
     assert sent is not None
     far = 1e5
-    G = terms(sent, LIGHTS, EYE)
-    assert G.max() > 0.02 and np.allclose(far**2 * terms_of_points(sent, far * LIGHTS, EYE), G, atol=2e-3 * G.max())
+    G, every = on_all(sent), every_patch(sent)
+    by_points = terms_of_points(sent, far * LIGHTS, EYE).on(every)
+    assert G.max() > 0.02 and np.allclose(far**2 * by_points, G, atol=2e-3 * G.max())
     # From the corner's own edge on, light reaches both plates alike, and a point twice as far a quarter of it.
-    near, twice = (terms_of_points(sent, np.array([[d, 0.0, d]]), EYE)[:, 0, 0].max() for d in (400.0, 800.0))
+    near, twice = (terms_of_points(sent, np.array([[d, 0.0, d]]), EYE).on(every)[:, 0, 0].max() for d in (400.0, 800.0))
     assert 3.6 < near / twice < 4.4
 
 
@@ -203,7 +227,7 @@ def test_colours_of_lobes_are_sent_channel_by_channel() -> None:
     tinted = replace(material, specular_weight=material.specular_weight[..., None] * (1.0, 0.5, 0.25))
     sent = coarse_senders(surface, tinted)
     assert sent is not None
-    G = terms(sent, LIGHTS, EYE)
+    G = on_all(sent)
     assert G.shape[-1] == 3 and np.allclose(G[..., 1], G[..., 0] / 2, atol=1e-6) and np.allclose(G[..., 2], G[..., 0] / 4, atol=1e-6)
 
 

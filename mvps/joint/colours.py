@@ -125,10 +125,10 @@ def _beyond_grey(of: Observed, sent: Senders) -> Callable[[int], Callable[[slice
     def of_view(i: int) -> Callable[[slice], Single]:
         samples, lights = of.views[i], of.lights[i]
         assert samples.gathered is not None
-        G = terms(sent, lights.direction.double().cpu().numpy(), of.capture.views[i].camera.centre)[:, :, 0]
+        G = terms(sent, lights.direction.double().cpu().numpy(), of.capture.views[i].camera.centre)
         rows, grey = weights[samples.vertex.cpu().numpy()], samples.gathered[..., :1].cpu().numpy()
         strength = np.float32(of.law.bounce) * lights.intensity.cpu().numpy()[:, None]
-        return lambda part: strength * ((rows[part] @ G.reshape(len(G), -1)).reshape(-1, *G.shape[1:]) - grey[part])
+        return lambda part: strength * (G.through(rows[part])[:, :, 0] - grey[part])
 
     return of_view
 

@@ -196,8 +196,8 @@ def with_gathered(views: list[ViewSamples], capture: Capture, surface: Surface, 
     weight = interpolation(senders.sources.of, surface.vertices, vertex_normals(surface))
 
     def one(i: int) -> ViewSamples:
-        G = terms(senders, lights.direction[i], capture.views[i].camera.centre)
-        values = (weight[views[i].vertex.cpu().numpy()] @ G.reshape(len(G), -1)).reshape(-1, *G.shape[1:])
+        sent = terms(senders, lights.direction[i], capture.views[i].camera.centre)
+        values = sent.through(weight[views[i].vertex.cpu().numpy()])
         return replace(views[i], gathered=torch.from_numpy(values).to(views[i].image.device))
 
     return on_cores(one, range(len(views)))

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvps.bounce import at
 from mvps.camera import view_directions
 from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
@@ -99,7 +98,7 @@ def pixel_normals(
     rows, shadow = chosen[hit], shadow_at(caster, material.law, points, direction)[hit]
     samples = _samples(view, points.position[hit], _beside(view, rows, shadow), intensity, rows, device)
     if sent is not None:
-        G = at(sent.sources, terms(sent, direction, view.camera.centre), points.position[hit], points.mesh_normal[hit])
+        G = terms(sent, direction, view.camera.centre).at(points.position[hit], points.mesh_normal[hit])
         samples = replace(samples, gathered=torch.from_numpy(G).to(device))
     known = np.column_stack([points.albedo.mean(1), points.specular_weight])[hit]
     reflectance, normal, light, grey = (
