@@ -28,6 +28,10 @@ GOOD_HULL = 0.2
 """Mean shift, pixels, that views ask of the hull, below which Stage I is left out: of what comes out of Stage I they ask 0.13 to 0.31 (five
 captures, docs/findings/stage_one.md), so it would do no better."""
 
+FINER = 0.75
+"""Edges of later turns' rounds over those of the first, where the model fits badly: normals on long ones are means over folds. Gold comes
+nearer with edges of 1.5 pixels in place of 2, and no nearer with 1.2 (docs/findings/stage_one.md)."""
+
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
 long as the residual falls."""
@@ -98,7 +102,7 @@ def in_turn(
     """Stage I and a coarse round in turn; what the last round made, and all rounds. words: Stage I's status.
 
     The field digs hollows by normals, the round goes on by photographs, and in a deeper hollow normals and lights are better: the field
-    is trained again from these while the model fits badly or lights turn, as long as the residual falls.
+    is trained again from these while the model fits badly, then with rounds on finer meshes, or lights turn, as long as the residual falls.
     """
     from mvps.device import chosen_device
     from mvps.joint.refine import MOVING_DEG
@@ -114,6 +118,8 @@ def in_turn(
     for turn in range(MOST_TURNS):
         if turn:
             surface = stage_one(field, refined.maps, CONTINUED, progress)
+        if turn == 1 and residual > POOR_FIT:
+            of_turn = replace(of_turn, rounds=tuple(replace(one, edge=FINER * one.edge) for one in of_turn.rounds))
         refined = stage_two("coarse refinement", capture, surface, refined, of_turn, settings, progress, carried)
         before, turned = residual, max(one["light_change_deg"] for one in refined.rounds)
         rounds, carried, residual = rounds + refined.rounds, refined.carried, refined.rounds[-1]["residual"]

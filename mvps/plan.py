@@ -65,6 +65,9 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True, detail=final)
 
 
+EASED_FUSIONS = 2
+"""Where photographs abound: a third moves bunny and armadillo by a thousandth of a pixel (docs/findings/stage_one.md)."""
+
 COARSE = RoundSettings(2.0, 2.4, 0.4, still=STILL_PIXELS, carving=True)
 """A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""
 
@@ -73,7 +76,7 @@ def carving_pass(free_lights: bool, eased: bool = False) -> RefineSettings:
     """What comes after Stage I: lights and normals on its surface, and hollows dug as deep as photographs tell, until vertices lie still
     where the model fits; where it does not, Stage I has a turn first. eased: photographs abound and the model fits, so less of each does
     (docs/findings/stage_one.md)."""
-    coarse = replace(COARSE, edge=2.5, fusions=2) if eased else COARSE
+    coarse = replace(COARSE, edge=2.5, fusions=EASED_FUSIONS) if eased else COARSE
     return RefineSettings((coarse,), free_lights=free_lights, half=True, eased=eased)
 
 
@@ -82,10 +85,10 @@ def once(plan: RefineSettings) -> RefineSettings:
     return replace(plan, rounds=tuple(replace(one, still=np.inf) for one in plan.rounds))
 
 
-def last_pass(preset: str, free_lights: bool, far: bool, before: list[dict[str, float]]) -> RefineSettings:
+def last_pass(preset: str, free_lights: bool, far: bool, before: list[dict[str, float]], eased: bool = False) -> RefineSettings:
     """Rounds after Stage I; sweeps reach as far as Stage I may be off. far: photographs have farther to pull the surface, because Stage I
     saw them at half their size, or had nothing but vertices' normals to go by, of views with fewer lights than tell a normal. before: what
-    the rounds before came to."""
+    the rounds before came to. eased: as in `carving_pass`."""
     first = RoundSettings(2.0, 1.2, 0.3, crease=0.1, still=STILL_PIXELS)
     rounds: tuple[RoundSettings, ...] = {
         "standard": (first, replace(first, for_detail=True)),
@@ -93,4 +96,6 @@ def last_pass(preset: str, free_lights: bool, far: bool, before: list[dict[str, 
     }[preset]
     if far:
         rounds = (COARSE, *rounds)
+    if eased:
+        rounds = tuple(replace(one, fusions=EASED_FUSIONS) for one in rounds)
     return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True, goes_on=before[-1]["goes_on"])

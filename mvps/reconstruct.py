@@ -38,8 +38,9 @@ TEXELS_PER_PIXEL = {"draft": 1, "standard": 2, "fine": 2}
 """Texels along one pixel's footprint. With two, interpolating twice (photograph, texture) loses little of what pixels hold; one takes half
 the time."""
 
-FEWER_LIGHTS = {"draft": 2, "standard": 1, "fine": 1}
-"""How many times fewer lights of a view tell its pixels' albedo than tell their six unknowns (mvps/joint/thinned.py)."""
+FEWER_LIGHTS = 2
+"""How many times fewer lights of a view tell its pixels' albedo than tell their six unknowns (mvps/joint/thinned.py), in `draft`, and in
+`standard` where photographs abound."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ def reconstruct(
     from mvps.cores import blas_as_asked
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
+    from mvps.joint.thinned import abundant
     from mvps.material import POOR_FIT
     from mvps.own_units import in_lengths, in_world_units, own_length
     from mvps.passes import stage_two
@@ -139,12 +141,13 @@ def reconstruct(
     else:
         start, rounds = coarse(used, settings, lights, parts, progress, step)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        free = lights is None and start.rounds[-1]["residual"] <= POOR_FIT
+        fits = start.rounds[-1]["residual"] <= POOR_FIT
+        free, eased = lights is None and fits, fits and settings.preset != "fine" and abundant(used)
         far = few_lights(used) or halvings(used) > 0
         start = replace(start, maps=()) if halvings(used) else start
-        plan, name = parts.of(last_pass(settings.preset, free, far, rounds)), "joint refinement"
+        plan, name = parts.of(last_pass(settings.preset, free, far, rounds, eased)), "joint refinement"
         refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
-        if lights is None and not free and start.status != "converged":
+        if lights is None and not fits and start.status != "converged":
             # Lights that stay where they still turned have not settled.
             refined = replace(refined, status=start.status, text=start.text)
     with progress.stage("lights and normals of all views"):
@@ -157,7 +160,7 @@ def reconstruct(
 def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, out: Path, progress: Progress) -> None:
     """Textures, report and the result folder."""
     from mvps.export import write_reconstruction
-    from mvps.joint.thinned import thinned
+    from mvps.joint.thinned import abundant, thinned
     from mvps.mesh import decimated
     from mvps.pbr import fit_error
     from mvps.report import report_html
@@ -166,7 +169,8 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     with progress.stage("textures") as stage:
         # A texel is seen by several views: their kept lights together determine its albedo several times over.
-        part, lights = thinned(used, lights_of(reconstruction, used), FEWER_LIGHTS[settings.preset])
+        fewer_lights = settings.preset == "draft" or (settings.preset == "standard" and abundant(used))
+        part, lights = thinned(used, lights_of(reconstruction, used), FEWER_LIGHTS if fewer_lights else 1)
         density = TEXELS_PER_PIXEL[settings.preset]
         surface = reconstruction.surface
         fewer = [faces for faces in settings.faces if faces < len(surface.faces)]

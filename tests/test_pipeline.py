@@ -16,9 +16,10 @@ from sphere_scene import RADIUS, make_sphere
 
 from mvps import coarse, evaluate, reconstruct
 from mvps.camera import pixel_footprint
-from mvps.coarse import MOST_TURNS, in_turn, shaped
+from mvps.coarse import FINER, MOST_TURNS, in_turn, shaped
 from mvps.command import run
 from mvps.export import read_reconstruction
+from mvps.joint.refine import RefineSettings
 from mvps.material import POOR_FIT
 from mvps.measures import distance_to
 from mvps.occupancy import CONTINUED, EASED, OccupancySettings
@@ -262,6 +263,7 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
 ) -> None:
     made = iter(zip(residuals, turned_deg, strict=True))
     trained: list[int] = []
+    edges: list[float] = []
 
     def refined(residual: float, turned: float) -> SimpleNamespace:
         one = {"residual": residual, "light_change_deg": turned, "vertex_change_px": 1.0}
@@ -272,11 +274,17 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
     def one(_: object, __: object, plan: OccupancySettings, *___: object) -> None:
         trained.append(plan.steps)
 
-    monkeypatch.setattr("mvps.coarse.stage_two", lambda *_: refined(*next(made)))
+    def two(_: str, __: object, ___: object, ____: object, plan: RefineSettings, *_____: object) -> SimpleNamespace:
+        edges.append(plan.rounds[0].edge)
+        return refined(*next(made))
+
+    monkeypatch.setattr("mvps.coarse.stage_two", two)
     monkeypatch.setattr("mvps.coarse.stage_one", one)
     monkeypatch.setattr("mvps.occupancy.Occupancy", lambda *_: None)
     monkeypatch.setattr("mvps.mesh.piece_count", lambda _: 1)
     plan = carving_pass(True, eased)
     last, rounds = in_turn(None, None, refined(0.3, 5.0), Settings("somewhere"), plan, None, "")  # type: ignore[arg-type]
+    first = plan.rounds[0].edge
+    assert edges == [first] + (turns - 1) * [FINER * first if residuals[0] > POOR_FIT else first]
     assert trained == [EASED.steps if eased else OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
     assert [r["residual"] for r in rounds[::2]] == list(residuals[:turns]) and last.rounds[0]["residual"] == residuals[turns - 1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,3 +80,5 @@ def test_coarse_rounds_are_done_again_while_vertices_move() -> None:
     assert coarse.carving and 0 < coarse.still < coarse.reach
     (eased,) = carving_pass(True, eased=True).rounds
     assert eased.edge > coarse.edge and eased.fusions < coarse.fusions and eased.still == coarse.still
+    first, later = (last_pass("standard", True, False, BEFORE, eased=eased).rounds[0] for eased in (False, True))
+    assert replace(first, fusions=later.fusions) == later and later.fusions < first.fusions
