@@ -66,7 +66,7 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
 
 
 EASED_FUSIONS = 2
-"""Where photographs abound: a third moves bunny and armadillo by a thousandth of a pixel (docs/findings/stage_one.md)."""
+"""Where photographs abound: a third one moves bunny and armadillo by two thousandths of a pixel at most (docs/findings/stage_one.md)."""
 
 COARSE = RoundSettings(2.0, 2.4, 0.4, still=STILL_PIXELS, carving=True)
 """A round on Stage I's surface; its sweep reaches as far as Stage I is off in hollows."""

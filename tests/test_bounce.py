@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from mvps.bounce import PATCH_EDGES, Gather, Sources, at, gather, gathered, lit_by, sources_on
+from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, gathered, lit_by, sources_on
+from mvps.gleam import Senders, terms_of_points
 from mvps.mesh import mean_edge_length, vertex_normals
-from mvps.scene import Surface
+from mvps.scene import Law, Surface
 from mvps.visibility import RayCaster, cast_shadow
 
 
@@ -101,11 +102,14 @@ def test_colours_mix_channel_by_channel_and_interpolate_to_points() -> None:
     room = hollow()
     albedo = np.tile([0.2, 0.4, 0.8], (len(room.vertices), 1))
     sources = coarse_sources(room, albedo)
-    G = under(sources, np.array([[0, 0, 1.0], [1.0, 0, 0]]), 0.0)
-    assert G.shape == (len(sources.albedo), 2, 3)
-    assert np.allclose(G[..., 1], 2 * G[..., 0], atol=1e-5) and np.allclose(G[..., 2], 4 * G[..., 0], atol=1e-5)
-    values = at(sources, G, room.vertices, vertex_normals(room))
-    assert values.shape == (len(room.vertices), 2, 3) and values.min() >= 0 and values.max() <= G.max() + 1e-6
+    # Lamps within: from without nothing lights a closed room.
+    sent = terms_of_points(Senders(sources, Law(())), np.array([[0, 0, 1.0], [1.0, 0, 0]]), np.zeros(3))
+    G = sent.on(np.arange(len(sources.albedo)))[:, :, 0]
+    assert G.shape == (len(sources.albedo), 2, 3) and G.min() > 0
+    assert np.allclose(G[..., 1], 2 * G[..., 0], rtol=1e-5) and np.allclose(G[..., 2], 4 * G[..., 0], rtol=1e-5)
+    values = sent.at(room.vertices, vertex_normals(room))[:, :, 0]
+    assert values.shape == (len(room.vertices), 2, 3)
+    assert (values >= 0.999 * G.min((0, 1))).all() and (values <= 1.001 * G.max((0, 1))).all()
 
 
 def test_patches_are_the_same_traced_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
