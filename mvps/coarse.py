@@ -30,7 +30,8 @@ captures, docs/findings/stage_one.md), so it would do no better."""
 
 FINER = 0.75
 """Edges of later turns' rounds over those of the first, where the model fits badly: normals on long ones are means over folds. Gold comes
-nearer with edges of 1.5 pixels in place of 2, and no nearer with 1.2 (docs/findings/stage_one.md)."""
+nearer with edges of 1.5 pixels in place of 2, and no nearer with 1.2: chosen on buddha, a bolt's surface is nearer too, its lights farther
+off (docs/findings/stage_one.md)."""
 
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
@@ -142,22 +143,27 @@ def begin(capture: Capture, masks: Capture, settings: Settings, lights: Lights |
     return Begun(grid, surface, start, maps, parts.law())
 
 
+def eased(preset: str, capture: Capture, rounds: list[dict[str, float]]) -> bool:
+    """Whether less of each does (docs/findings/stage_one.md): photographs abound and the model fits after these rounds. `fine` takes
+    its time for the little that is to be had."""
+    from mvps.joint.thinned import abundant
+    from mvps.material import POOR_FIT
+
+    return preset != "fine" and abundant(capture) and rounds[-1]["residual"] <= POOR_FIT
+
+
 def coarse(
     used: Capture, settings: Settings, lights: Lights | None, parts: Parts, progress: Progress, step: Step
 ) -> tuple[Refined, list[dict[str, float]]]:
     """Shape, lights and normals for the last rounds to start from, and the rounds that they took, moves in pixels of `used`. Of large
     photographs at half their size, or less; what is found there is pulled to what each larger level but the last shows."""
-    from mvps.joint.thinned import abundant
-    from mvps.material import POOR_FIT
     from mvps.plan import carving_pass, first_pass
 
     sizes = half_sizes(used, progress)
     level = sizes.pop()
     begun, plan = begin(level, used, settings, lights, parts, progress), parts.of(first_pass(lights is None, False))
     rough = step("first refinement", lambda: stage_two("first refinement", level, begun.surface, begun, plan, settings, progress))
-    # `fine` takes its time for the little that is to be had.
-    eased = settings.preset != "fine" and abundant(level) and rough.rounds[-1]["residual"] <= POOR_FIT
-    turns = parts.of(carving_pass(lights is None, eased))
+    turns = parts.of(carving_pass(lights is None, eased(settings.preset, level, rough.rounds)))
     found: Refined
     found, rounds = step("shape", lambda: shaped(level, begun.grid, rough, settings, turns, progress))
     rounds = in_pixels(rounds, 2 ** len(sizes))

@@ -56,7 +56,7 @@ LIGHTS_AT_A_TIME = 64
 """A multiple of SUBPIXELS: shares of parts are parts of shares."""
 
 ARRIVING_KEPT = 16
-"""Of such parts of the lights, what surfaces send each other, for the next pixels: 15 MB each with lobes."""
+"""Of such parts of the lights, what surfaces send each other, for the next pixels: 19 MB each with lobes."""
 
 Sent = Callable[[int], Arriving | None]
 """What other surfaces send under the LIGHTS_AT_A_TIME lights from this one on, or under the points of light where it is below 0."""

@@ -110,11 +110,10 @@ def reconstruct(
 ) -> Reconstruction:
     """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
-    from mvps.coarse import coarse
+    from mvps.coarse import coarse, eased
     from mvps.cores import blas_as_asked
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
-    from mvps.joint.thinned import abundant
     from mvps.material import POOR_FIT
     from mvps.own_units import in_lengths, in_world_units, own_length
     from mvps.passes import stage_two
@@ -141,13 +140,12 @@ def reconstruct(
     else:
         start, rounds = coarse(used, settings, lights, parts, progress, step)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        fits = start.rounds[-1]["residual"] <= POOR_FIT
-        free, eased = lights is None and fits, fits and settings.preset != "fine" and abundant(used)
+        free, less = lights is None and start.rounds[-1]["residual"] <= POOR_FIT, eased(settings.preset, used, start.rounds)
         far = few_lights(used) or halvings(used) > 0
         start = replace(start, maps=()) if halvings(used) else start
-        plan, name = parts.of(last_pass(settings.preset, free, far, rounds, eased)), "joint refinement"
+        plan, name = parts.of(last_pass(settings.preset, free, far, rounds, less)), "joint refinement"
         refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
-        if lights is None and not fits and start.status != "converged":
+        if lights is None and not free and start.status != "converged":
             # Lights that stay where they still turned have not settled.
             refined = replace(refined, status=start.status, text=start.text)
     with progress.stage("lights and normals of all views"):
