@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from mvps.cores import neighbours
 from mvps.mesh import face_normals, mean_edge_length, vertex_normals
+from mvps.once import once_for
 from mvps.scene import Bool, Float, Int, Surface
 from mvps.visibility import RayCaster, cast_shadow, ray_caster
 
@@ -129,7 +130,7 @@ class Sources:
 
 def sources_on(of: Gather, surface: Surface, albedo: Float) -> Sources:
     """The sources of a surface whose vertices have `albedo` (V,) or (V, channels), on patches of it or of one that is about the same."""
-    weight = interpolation(of, surface.vertices, vertex_normals(surface)).T.tocsr()
+    weight = on_vertices(of, surface).T.tocsr()
     total = np.asarray(weight.sum(1))[:, 0]
     near = total > 1e-6
     # A patch to which no vertex is near has no albedo of its own.
@@ -219,3 +220,9 @@ def interpolation(of: Gather, points: Float, normal: Float) -> sp.csr_matrix:
     weight /= weight.sum(1, keepdims=True)
     rows = np.repeat(np.arange(len(points)), NEIGHBOURS)
     return sp.csr_matrix((weight.astype(np.float32).ravel(), (rows, index.ravel())), (len(points), len(of.normal)))
+
+
+@once_for
+def on_vertices(of: Gather, surface: Surface) -> sp.csr_matrix:
+    """The same at the vertices of a surface."""
+    return interpolation(of, surface.vertices, vertex_normals(surface))

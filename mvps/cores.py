@@ -12,8 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,23 +76,6 @@ def one_by_one(task: Callable[[int], Result], total: int) -> Iterator[Result]:
             waiting.append(pool.submit(task, number))
         while waiting:
             yield waiting.popleft().result()
-
-
-class computed_once(cached_property[Result]):
-    """A cached property that is computed once even where threads ask for it at the same time (functools' own, from Python 3.12 on, by
-    each of them)."""
-
-    def __init__(self, function: Callable[[Any], Result]) -> None:
-        super().__init__(function)
-        self._lock = threading.RLock()
-
-    @overload
-    def __get__(self, instance: None, owner: type[Any] | None = None) -> Self: ...
-    @overload
-    def __get__(self, instance: object, owner: type[Any] | None = None) -> Result: ...
-    def __get__(self, instance: object, owner: type[Any] | None = None) -> Any:
-        with self._lock:
-            return super().__get__(instance, owner)
 
 
 def neighbours(tree: cKDTree, points: NDArray[Any], k: int = 1, p: float = 2) -> tuple[NDArray[Any], NDArray[Any]]:

@@ -20,6 +20,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -78,6 +79,8 @@ def choose(largest: Model, held_out: Callable[[Model], Float], sharpen: bool = T
     sharpness, which takes longer than all else. held_out gives the errors, as in `judged`, of held-out samples under a model, NaN where a
     vertex has none.
     """
+    # The search for the lobes' sharpness comes by the same models again.
+    held_out = cache(held_out)
     model = Model()
     errors = held_out(model)
     trials = []

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
+from mvps.once import once_for
 from mvps.scene import Bool, Float, Int, Surface
 
 KNIFE_EDGE = 90.0
@@ -51,17 +51,20 @@ def angles_deg(a: Float, b: Float) -> Float:
     return angle
 
 
+@once_for
 def face_normals(surface: Surface) -> Float:
     """(F, 3) unit outward normals; zero for a degenerate face."""
     return normalise(face_cross(surface))
 
 
+@once_for
 def face_areas(surface: Surface) -> Float:
     """(F,) areas."""
     areas: Float = lengths(face_cross(surface)) / 2
     return areas
 
 
+@once_for
 def vertex_areas(surface: Surface) -> Float:
     """(V,) a third of the faces at each vertex: they sum to the surface's area."""
     areas = np.zeros(len(surface.vertices))
@@ -69,20 +72,10 @@ def vertex_areas(surface: Surface) -> Float:
     return areas
 
 
-_normals: WeakKeyDictionary[Surface, Float] = WeakKeyDictionary()
-
-
+@once_for
 def vertex_normals(surface: Surface) -> Float:
     """(V, 3) unit outward normals: face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998). Read-only, made once
-    for a surface."""
-    known = _normals.get(surface)
-    if known is None:
-        known = _normals[surface] = _vertex_normals(surface)
-        known.flags.writeable = False
-    return known
-
-
-def _vertex_normals(surface: Surface) -> Float:
+    for a surface, like others here."""
     corners = [surface.vertices[surface.faces[:, k]] for k in range(3)]
     sides = [corners[(k + 1) % 3] - corners[k] for k in range(3)]
     outward = cross(sides[0], sides[1])
@@ -98,6 +91,7 @@ def _vertex_normals(surface: Surface) -> Float:
     return normalise(total)
 
 
+@once_for
 def edges(surface: Surface) -> Int:
     """(E, 2) undirected edges, the smaller index first, each once."""
     n = len(surface.vertices)
@@ -132,6 +126,7 @@ def edge_numbers(faces: Int, n: int) -> Int:
     return np.minimum(faces, other) * n + np.maximum(faces, other)
 
 
+@once_for
 def mean_edge_length(surface: Surface) -> float:
     """Mean length of the faces' sides: of the edges, those at a border counting half."""
     corners = surface.vertices[surface.faces]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from mvps.cores import on_cores
+from mvps.once import once_for
 from mvps.scene import Capture, View
 
 INTERPOLATED = 2 / 3
@@ -34,26 +35,28 @@ def dark_noise_share(capture: Capture) -> float:
 
 def _share(capture: Capture, part: float) -> float:
     """The same of the darkest `part` of each photograph's pixels."""
-
-    def of_view(view: View) -> list[float]:
-        shares = []
-        for k in range(0, len(view.lights), max(1, len(view.lights) // LIGHTS_ASKED)):
-            if not view.usable([k]).any():
-                continue
-            image = np.full(view.mask.shape, np.nan)
-            image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
-            second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
-            around = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
-            known = np.isfinite(second)
-            second, around = second[known], around[known]
-            level = np.sqrt(np.nanmean(image**2))
-            if len(second) and level > 0:
-                second = second[around <= np.quantile(around, part)]
-                shares.append(float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6)) / level))
-        return shares
-
-    found = [share for shares in on_cores(of_view, capture.views) for share in shares]
+    found = [share for shares in on_cores(lambda view: _shares(view, part), capture.views) for share in shares]
     return float(np.median(found)) if found else 0.0
+
+
+@once_for
+def _shares(view: View, part: float) -> list[float]:
+    """The same of some photographs of a view."""
+    shares = []
+    for k in range(0, len(view.lights), max(1, len(view.lights) // LIGHTS_ASKED)):
+        if not view.usable([k]).any():
+            continue
+        image = np.full(view.mask.shape, np.nan)
+        image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
+        second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
+        around = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
+        known = np.isfinite(second)
+        second, around = second[known], around[known]
+        level = np.sqrt(np.nanmean(image**2))
+        if len(second) and level > 0:
+            second = second[around <= np.quantile(around, part)]
+            shares.append(float(np.median(np.abs(second)) / (0.6745 * np.sqrt(6)) / level))
+    return shares
 
 
 def samples_noise(capture: Capture) -> float:

@@ -24,7 +24,6 @@ so that there the outline is h rate farther out along u than the segment. (Left 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
@@ -34,6 +33,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 from mvps.camera import footprint, inside_image, project, rays
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise
+from mvps.once import once_for
 from mvps.scene import Bool, Camera, Capture, Float, Int, View
 from mvps.visibility import RayCaster
 
@@ -74,14 +74,15 @@ def mask_distance(mask: Bool) -> NDArray[np.float32]:
     return smooth
 
 
-_distances: WeakKeyDictionary[View, NDArray[np.float32]] = WeakKeyDictionary()
+@once_for
+def _of_view(view: View) -> NDArray[np.float32]:
+    """`mask_distance` of a view."""
+    return mask_distance(view.mask)
 
 
 def mask_distances(capture: Capture) -> list[NDArray[np.float32]]:
     """`mask_distance` of every view, made once for a view, on all cores."""
-    new = [view for view in capture.views if view not in _distances]
-    _distances.update(zip(new, on_cores(mask_distance, [view.mask for view in new]), strict=True))
-    return [_distances[view] for view in capture.views]
+    return on_cores(_of_view, capture.views)
 
 
 def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:

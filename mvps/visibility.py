@@ -17,8 +17,9 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from mvps.camera import pixel_centres, project, rays, view_directions
-from mvps.cores import computed_once, on_cores
+from mvps.cores import on_cores
 from mvps.mesh import edges, mean_edge_length, vertex_normals
+from mvps.once import computed_once, once_for
 from mvps.scene import Bool, Camera, Float, Int, Surface
 
 RAYS_PER_CALL = 1 << 18
@@ -124,6 +125,7 @@ def interpolate(surface: Surface, hits: Hits, values: Float) -> Float:
     return interpolated
 
 
+@once_for
 def visible_vertices(caster: RayCaster, camera: Camera, margin: int = 0) -> Bool:
     """(V,) True where a vertex lies on the image, faces the camera and nothing hides it, nor a vertex that faces the camera within `margin`
     edges of it."""

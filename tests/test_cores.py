@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from mvps.cores import at_a_time, computed_once, on_cores, one_by_one
+from mvps.cores import at_a_time, on_cores, one_by_one
 
 ASK = """
 import numpy, json
@@ -63,22 +63,3 @@ def test_results_come_in_order_and_the_first_failure_is_told() -> None:
     assert on_cores(lambda a: a, []) == []
     with pytest.raises(ZeroDivisionError):
         on_cores(lambda a: 1 / a, [1, 0, 2])
-
-
-def test_what_is_computed_once_is_so_for_threads_that_ask_together() -> None:
-    calls = []
-
-    class Slow:
-        @computed_once
-        def value(self) -> int:
-            calls.append(1)
-            time.sleep(0.02)
-            return 7
-
-    slow = Slow()
-    asked = [threading.Thread(target=lambda: slow.value) for _ in range(8)]
-    for thread in asked:
-        thread.start()
-    for thread in asked:
-        thread.join()
-    assert slow.value == 7 and calls == [1]

@@ -36,7 +36,7 @@ FEWEST = 3
 
 def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
     """The capture with masks mended and wrong views left out, and what was found."""
-    mended, findings = _moved(capture)
+    mended, shown, findings = _moved(capture)
     if len(mended.views) < FEWEST:
         return mended, findings
     cones = Cones(mended)
@@ -45,7 +45,7 @@ def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
         mended, of_point = pointed(mended, body)
         cones = Cones(mended) if of_point else cones
         findings = [*findings, *of_point]
-    mended, of_parts = _parted(cones)
+    mended, of_parts = _parted(cones, shown)
     left, of_views = _left_out(Cones(mended) if of_parts else cones)
     return left, [*findings, *of_parts, *of_views]
 
@@ -57,16 +57,17 @@ def _seen(view: View) -> tuple[Lit | None, Bool | None]:
     return found, moved(view, distance, found) if found is not None and found.off and view.files else None
 
 
-def _moved(capture: Capture) -> tuple[Capture, list[Finding]]:
-    """Masks that are off as a whole, with their boundary where the object ends."""
+def _moved(capture: Capture) -> tuple[Capture, list[Lit | None], list[Finding]]:
+    """Masks that are off as a whole, with their boundary where the object ends; what the photographs show beside them; what was found."""
     seen = on_cores(_seen, capture.views)
-    views, edges = list(capture.views), {}
+    views, shown, edges = list(capture.views), [found for found, _ in seen], {}
     for at, (found, mask) in enumerate(seen):
         if found is not None and mask is not None and mask.any():
             views[at] = with_mask(views[at], mask)
+            shown[at] = lit_part(views[at], steps(mask))
             edges[views[at].name] = found.edge
     if not edges:
-        return capture, []
+        return capture, shown, []
     where = "all views" if len(edges) == len(views) else ", ".join(edges)
     middle = float(np.median(list(edges.values())))
     way = "larger" if middle < 0 else "smaller"
@@ -75,20 +76,19 @@ def _moved(capture: Capture) -> tuple[Capture, list[Finding]]:
         f" {abs(middle):.1f} pixels {'inside' if middle < 0 else 'outside'} the boundary (median), more than the pixels' staircase"
         " explains; moved to where it ends"
     )
-    return Capture(capture.name, tuple(views)), [Finding("mask", where, text, True)]
+    return Capture(capture.name, tuple(views)), shown, [Finding("mask", where, text, True)]
 
 
-def _parted(cones: Cones) -> tuple[Capture, list[Finding]]:
-    """The capture, its masks without what is none of the object and with what they lack of it."""
+def _parted(cones: Cones, shown: list[Lit | None]) -> tuple[Capture, list[Finding]]:
+    """The capture, its masks without what is none of the object and with what they lack of it, by what the photographs show."""
     capture = cones.capture
 
-    def parts_of(view: View) -> tuple[list[Bool], list[Bool]]:
-        found = lit_part(view, steps(view.mask))
+    def parts_of(view: View, found: Lit | None) -> tuple[list[Bool], list[Bool]]:
         if found is None or not found.judged or not view.files:
             return [], []
         return stray_parts(view.mask, found), missing_parts(view.mask, found) if found.dark else []
 
-    parts = on_cores(parts_of, capture.views)
+    parts = on_cores(parts_of, capture.views, shown)
     if not any(stray or missing for stray, missing in parts):
         return capture, []
     views = list(capture.views)

@@ -48,13 +48,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvps.bounce import interpolation
+from mvps.bounce import on_vertices
 from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
 from mvps.joint.reflectance import Chunk, Observed, chunks
 from mvps.joint.trial import parted
 from mvps.material import Trial, judged
-from mvps.mesh import vertex_normals
 from mvps.scene import Bool, Float
 from mvps.shading import most_albedo
 
@@ -120,7 +119,7 @@ def _over_lights(weight: Single, values: Single) -> Single:
 
 def _beyond_grey(of: Observed, sent: Senders) -> Callable[[int], Callable[[slice], Single]]:
     """e b (G_c - G) (n, lights, 3) of some pairs of a view by its number."""
-    weights = interpolation(sent.sources.of, of.surface.vertices, vertex_normals(of.surface))
+    weights = on_vertices(sent.sources.of, of.surface)
 
     def of_view(i: int) -> Callable[[slice], Single]:
         samples, lights = of.views[i], of.lights[i]

@@ -51,7 +51,7 @@ def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest
     pairs = edges(surface)
     # Neighbours within half a pixel share their samples: what they differ by is not seen.
     length = np.maximum(lengths(surface.vertices[pairs[:, 0]] - surface.vertices[pairs[:, 1]]) / pixel, 0.5)
-    ends = torch.from_numpy(pairs).to(normal.device)
+    ends = torch.tensor(pairs, device=normal.device)
     change = (normal[ends[:, 0]] - normal[ends[:, 1]]).square().sum(1) / tensor32(length, normal.device) ** 2
     total, count = torch.zeros_like(normal[:, 0]), torch.zeros_like(normal[:, 0])
     for end in ends.T:

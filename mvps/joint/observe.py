@@ -22,11 +22,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvps.bounce import interpolation
+from mvps.bounce import on_vertices
 from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
-from mvps.mesh import vertex_normals
+from mvps.once import once_for
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, ray_caster, shade_of, visible_vertices
 
@@ -98,6 +98,7 @@ class ViewSamples:
         return (slice(start, start + step) for start in range(0, len(self.vertex), step))
 
 
+@once_for
 def interior(view: View) -> NDArray[np.float32]:
     """(pixels,) 1 where all eight neighbours of a foreground pixel are foreground, else 0."""
     eroded = cv2.erode(view.mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0)
@@ -193,7 +194,7 @@ def observe(
 
 def with_gathered(views: list[ViewSamples], capture: Capture, surface: Surface, senders: Senders, lights: Lights) -> list[ViewSamples]:
     """The samples of a capture's views with what other surfaces send to them under the lights."""
-    weight = interpolation(senders.sources.of, surface.vertices, vertex_normals(surface))
+    weight = on_vertices(senders.sources.of, surface)
 
     def one(i: int) -> ViewSamples:
         sent = terms(senders, lights.direction[i], capture.views[i].camera.centre)

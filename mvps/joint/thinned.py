@@ -7,8 +7,8 @@ the largest number that leaves ENOUGH_LIGHTS of each view and ENOUGH_PHOTOGRAPHS
 from __future__ import annotations
 
 from collections.abc import Sequence
-from weakref import WeakKeyDictionary
 
+from mvps.once import once_for
 from mvps.scene import Capture, Lights
 
 ENOUGH_LIGHTS = 12
@@ -32,7 +32,11 @@ def abundant(capture: Capture) -> bool:
     return sum(min(len(view.lights), ENOUGH_LIGHTS) for view in capture.views) >= ENOUGH_PHOTOGRAPHS
 
 
-_parts: WeakKeyDictionary[Capture, dict[int, Capture]] = WeakKeyDictionary()
+@once_for
+def _part(capture: Capture, fewer: int) -> Capture:
+    """The capture with the kept lights of each view, its samples copied."""
+    keep = kept([len(view.lights) for view in capture.views], fewer)
+    return capture.select({view.name: view.lights[rows] for view, rows in zip(capture.views, keep, strict=True)})
 
 
 def thinned(capture: Capture, lights: Lights, fewer: int = 1) -> tuple[Capture, Lights]:
@@ -40,12 +44,8 @@ def thinned(capture: Capture, lights: Lights, fewer: int = 1) -> tuple[Capture, 
     keep = kept([len(view.lights) for view in capture.views], fewer)
     if all(rows.step == 1 for rows in keep):
         return capture, lights
-    parts = _parts.setdefault(capture, {})
-    if fewer not in parts:
-        numbers = {view.name: view.lights[rows] for view, rows in zip(capture.views, keep, strict=True)}
-        parts[fewer] = capture.select(numbers)
     direction, intensity = (
         tuple(values[rows] for rows, values in zip(keep, of_views, strict=True)) for of_views in (lights.direction, lights.intensity)
     )
     # Views keep different lights of the rig.
-    return parts[fewer], Lights(direction, intensity, False)
+    return _part(capture, fewer), Lights(direction, intensity, False)
