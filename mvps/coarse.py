@@ -33,6 +33,10 @@ FINER = 0.75
 nearer with edges of 1.5 pixels in place of 2, and no nearer with 1.2: chosen on buddha, a bolt's surface is nearer too, its lights farther
 off (docs/findings/stage_one.md)."""
 
+FINER_FROM = 2
+"""Turns before these: one that fits badly may do so because its lights are still on their way, and edges of two pixels are better then
+(statue of copper; docs/findings/stage_one.md)."""
+
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
 long as the residual falls."""
@@ -119,7 +123,7 @@ def in_turn(
     for turn in range(MOST_TURNS):
         if turn:
             surface = stage_one(field, refined.maps, CONTINUED, progress)
-        if turn == 1 and residual > POOR_FIT:
+        if turn == FINER_FROM and residual > POOR_FIT:
             of_turn = replace(of_turn, rounds=tuple(replace(one, edge=FINER * one.edge) for one in of_turn.rounds))
         refined = stage_two("coarse refinement", capture, surface, refined, of_turn, settings, progress, carried)
         before, turned = residual, max(one["light_change_deg"] for one in refined.rounds)

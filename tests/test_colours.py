@@ -100,6 +100,23 @@ def test_an_albedo_that_no_surface_has_is_unknown() -> None:
     assert np.isnan(found[dark]).all() and np.nanmax(found) < 2 * albedo.max()
 
 
+def test_lights_have_their_colours_where_next_to_nothing_arrives_at_a_vertex() -> None:
+    """Squares of what arrives are below the least number there is, and albedo would be beyond the largest: all lights came out white."""
+    of, ratios, _ = observed(WHITE)
+    dark = int(of.views[0].vertex[len(of.views[0].vertex) // 2])
+    normals = of.vertices.normal.clone()
+    normals[dark] *= -1
+    views = []
+    for samples in of.views:
+        here = (samples.vertex == dark)[:, None]
+        arrives = torch.where(here, 1e-24, torch.zeros_like(samples.image))[..., None]
+        # Lights that do not reach the vertex reach what is turned the other way.
+        views.append(replace(samples, gathered=arrives, data=samples.data & (~here | (samples.image > 0))))
+    of = of._replace(views=views, vertices=replace(of.vertices, normal=normals), law=replace(of.law, bounce=1.0))
+    found = light_ratios(of, [np.ones_like(ratio) for ratio in ratios], True)[0]
+    assert np.abs(white_on_average(found) / white_on_average(ratios[0]) - 1).mean() < 0.001
+
+
 def test_what_coloured_walls_send_is_not_taken_for_their_own_colour() -> None:
     """In grey the walls of a bowl come out too red, by what red walls send them; about a third of that is left where it has their colour
     (0.055 and 0.019)."""

@@ -16,7 +16,7 @@ from sphere_scene import RADIUS, make_sphere
 
 from mvps import coarse, evaluate, reconstruct
 from mvps.camera import pixel_footprint
-from mvps.coarse import FINER, MOST_TURNS, in_turn, shaped
+from mvps.coarse import FINER, FINER_FROM, MOST_TURNS, in_turn, shaped
 from mvps.command import run
 from mvps.export import read_reconstruction
 from mvps.joint.refine import RefineSettings
@@ -285,6 +285,6 @@ def test_stage_one_and_two_take_turns_until_the_model_fits_and_lights_stand(
     plan = carving_pass(True, eased)
     last, rounds = in_turn(None, None, refined(0.3, 5.0), Settings("somewhere"), plan, None, "")  # type: ignore[arg-type]
     first = plan.rounds[0].edge
-    assert edges == [first] + (turns - 1) * [FINER * first if residuals[0] > POOR_FIT else first]
+    assert edges == [FINER * first if turn >= FINER_FROM and residuals[1] > POOR_FIT else first for turn in range(turns)]
     assert trained == [EASED.steps if eased else OccupancySettings().steps] + (turns - 1) * [CONTINUED.steps]
     assert [r["residual"] for r in rounds[::2]] == list(residuals[:turns]) and last.rounds[0]["residual"] == residuals[turns - 1]

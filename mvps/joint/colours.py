@@ -218,9 +218,14 @@ def colours(of: Observed, ratios: Sequence[Float], kind: LobeColour, sent: Sende
     sums = _sums(of, ratios, partial(chunks, of), sent)
     tint = _of_kind(kind, sums)
     albedo = _albedo(sums, tint)
+    return np.where(_possible(of, sums, albedo), albedo, np.nan), tint
+
+
+def _possible(of: Observed, sums: _Sums, albedo: Float) -> Bool:
+    """(V, 3) where a view sees the vertex and the albedo (V, 3) could be that strong: where the model takes a vertex to be all but dark it
+    is light over next to nothing."""
     seen = torch.from_numpy(sums.qq.any(1)).to(of.vertices.reflectance.device)
-    known = (sums.qq > 0) & (albedo.mean(1, keepdims=True) <= most_albedo(of.vertices.reflectance[seen], of.law))
-    return np.where(known, albedo, np.nan), tint
+    return np.asarray((sums.qq > 0) & (albedo.mean(1, keepdims=True) <= most_albedo(of.vertices.reflectance[seen], of.law)))
 
 
 def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float]:
@@ -233,6 +238,7 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
         tint, variance = _tint(sums)
         tints = _tints(sums, tint)
         albedo = _albedo(sums, tints)
+        albedo, tints = np.where(_possible(of, sums, albedo), (albedo, tints), 0)
         solved = _white(_ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tints), range(len(kept))), one_rig))
         # The tint is that under lights which were perhaps not white on average.
         under = np.concatenate(ratios).mean(0)

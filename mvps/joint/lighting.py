@@ -18,7 +18,7 @@ from mvps.joint.patches import Patches
 from mvps.joint.reflectance import Observed
 from mvps.joint.state import State, relative_residuals
 from mvps.joint.steps import Anchor, possible, vertex_step
-from mvps.joint.strengths import Strengths, as_bright, borne_out, needed, strengths_in, strengths_of, unknown_in
+from mvps.joint.strengths import Strengths, Told, as_bright, borne_out, needed, strengths_in, strengths_of, unknown_in
 from mvps.memory import room_for, solved_together
 from mvps.mesh import angles_deg, edges, lengths
 from mvps.scene import Capture, Law, Lights, Surface
@@ -113,20 +113,25 @@ def solved_lights(
                 part = vertex_step(few, part, lights, law, tie, patches=patches)
         return _Solved(before, lights, law, part, strengths)
 
+    def told_of(solved: _Solved) -> Told:
+        so_far = solved.strengths or as_bright(solved.lights)
+        return told_of_strengths(few, solved.part, solved.lights, solved.law, tie, patches, rotations, of_law, so_far)
+
     found = stepped(_Solved(lights, lights, state.law, part, strengths), LIGHT_STEPS)
-    while least is not None and free_lights and rig:
-        so_far = found.strengths or as_bright(found.lights)
-        told = told_of_strengths(few, found.part, found.lights, found.law, tie, patches, rotations, of_law, so_far)
+    told = told_of(found) if least is not None and free_lights and rig else None
+    while told is not None and least is not None:
         unknown = needed(told, len(found.lights[0].intensity), least)
         if unknown <= (found.strengths.unknown if found.strengths else 0):
             break
         together = solved_together(state.lights, unknown * len(lights))
         room_for(len(state.surface.vertices), lights=together)
         # Lights that were solved as if all were as bright are solved again, from farther off than a round's steps begin.
-        trial = stepped(found._replace(strengths=replace(so_far, unknown=unknown)), 2 * LIGHT_STEPS)
-        if not borne_out(told, unknown, *(_unexplained(few, one.part) for one in (found, trial))):
+        trial = stepped(found._replace(strengths=replace(found.strengths or as_bright(found.lights), unknown=unknown)), 2 * LIGHT_STEPS)
+        then = told_of(trial)
+        assert trial.strengths is not None
+        if not borne_out(told, then, trial.strengths, *(_unexplained(few, one.part) for one in (found, trial))):
             break
-        found, state.together = trial, together
+        found, told, state.together = trial, then, together
     before, lights, state.law = found.before, found.lights, found.law
     turned = [angles_deg(a.direction.cpu().numpy(), b.direction.cpu().numpy()) for a, b in zip(before, lights, strict=True)]
     solved = coloured_lights(lights, [channel_ratio(e) for e in state.lights.intensity], state.lights)

@@ -11,8 +11,10 @@ with the residual and with itself, the strength of a photograph explains beside 
 
 Of the sum what a tenth of the photographs explains counts as twice what all others do at most, for a black one is no flicker: of a normal
 distribution's squares the largest tenth has 0.44. And strengths of views, whose vertices' albedo makes up for most of them, explain
-g^T S^-1 g / r^2 with them less that without, S the lights' system. They stay where half of as much is gone once they are solved: what
-is wrong with a badly fitting model looks like photographs that are not as bright, and is not mended by strengths.
+g^T S^-1 g / r^2 with them less that without, S the lights' system. They stay where half of as much is gone once they are solved, and where
+they have settled: what is wrong with a badly fitting model or a wrong shape looks like photographs that are not as bright, but either is
+not mended by strengths, or they creep on, or those of photographs have to be many times as far apart as what they explain is wrong by, for
+each undoes what others do.
 """
 
 from __future__ import annotations
@@ -47,6 +49,15 @@ MOST = 0.22
 GONE = 0.5
 """Part of what strengths' next step explains that has to be gone once they are solved. Under lamps that did flicker 0.74 of it was, and
 more; on metals with flat and round sides, all photographs as bright, at most a fifth, on most more was left than before
+(docs/findings/lights.md)."""
+
+SETTLED = 0.1
+"""Of the squares that strengths' next step explained, the most that it may explain once they are solved: under lamps that did flicker 0.02
+and less, on a metal with flat sides 0.8 (docs/findings/lights.md)."""
+
+APART = 3.0
+"""Standard deviation of the logarithms of photographs' strengths over the root mean square share of the signal that they explain, at most:
+1.3 to 2.8 under lamps that did flicker, 3.5 to 12 where strengths stood in for a wrong shape, or were wrong by as much themselves
 (docs/findings/lights.md)."""
 
 TENTH = 0.1
@@ -120,11 +131,17 @@ def needed(told: Told, lights: int, least: float) -> int:
     if lights > 1 and told.photographs > max(MOST, told.lights):
         return lights
     step = np.array(told.of_views)
-    return int(np.abs(step - step.mean()).max() > ALIKE and told.views >= least)
+    # What single photographs explain more of is no exposure of views.
+    return int(np.abs(step - step.mean()).max() > ALIKE and told.views >= max(least, told.photographs))
 
 
-def borne_out(told: Told, unknown: int, before: float, after: float) -> bool:
-    """Whether strengths, as many `unknown` ones of a view, took at least GONE of what was told off what is unexplained; before, after:
-    root mean squares."""
-    explained = told.photographs if unknown > 1 else told.views
-    return after**2 <= before**2 * (1 - GONE * explained)
+def borne_out(told: Told, then: Told, strengths: Strengths, before: float, after: float) -> bool:
+    """Whether strengths took at least GONE of what was told off what is unexplained, have SETTLED, and are no more APART than explains
+    it; then: what is told once they are solved; before, after: root mean squares of what is unexplained."""
+    of_photographs = strengths.unknown > 1
+    explained, left = (rms**2 * (one.photographs if of_photographs else one.views) for one, rms in ((told, before), (then, after)))
+    if after**2 > before**2 - GONE * explained or left > SETTLED * explained:
+        return False
+    log = torch.stack(strengths.of).double().log()
+    # Those of views are mostly made up for by vertices' albedo.
+    return not of_photographs or float((log - log.mean(1, keepdim=True)).square().mean()) <= APART**2 * explained
