@@ -138,10 +138,10 @@ def needed(told: Told, lights: int, least: float) -> int:
 def borne_out(told: Told, then: Told, strengths: Strengths, before: float, after: float) -> bool:
     """Whether strengths took at least GONE of what was told off what is unexplained, have SETTLED, and are no more APART than explains
     it; then: what is told once they are solved; before, after: root mean squares of what is unexplained."""
-    of_photographs = strengths.unknown > 1
-    explained, left = (rms**2 * (one.photographs if of_photographs else one.views) for one, rms in ((told, before), (then, after)))
+    of_each = strengths.unknown > 1
+    explained, left = (rms**2 * (one.photographs if of_each else one.views) for one, rms in ((told, before), (then, after)))
     if after**2 > before**2 - GONE * explained or left > SETTLED * explained:
         return False
     log = torch.stack(strengths.of).double().log()
     # Those of views are mostly made up for by vertices' albedo.
-    return not of_photographs or float((log - log.mean(1, keepdim=True)).square().mean()) <= APART**2 * explained
+    return not of_each or float((log - log.mean(1, keepdim=True)).square().mean()) <= APART**2 * explained
