@@ -37,6 +37,11 @@ FINER_FROM = 2
 """Turns before these: one that fits badly may do so because its lights are still on their way, and edges of two pixels are better then
 (statue of copper; docs/findings/stage_one.md)."""
 
+SIGNS = 0.5**0.5
+"""Of what a model leaves that fits badly, beyond noise, what one may leave all over whose misfits still are signs of hollows: half of the
+variance. A cut stone of aluminium left 0.10 and was farther off when it was dug; fourteen others that were dug left up to 0.05
+(docs/findings/hollows.md)."""
+
 MOST_TURNS = 6
 """Of Stage I and a round of Stage II. One is enough where the model fits; where it fits badly each takes another part off the errors, as
 long as the residual falls."""
@@ -75,7 +80,6 @@ def shaped(
     is good enough stays, but for hollows; an object that the model fits badly all over gives no sign of them."""
     from mvps.digging import hollowed, pitted
     from mvps.joint.pixels import few_lights
-    from mvps.material import POOR_FIT
 
     rounds, shift = list(rough.rounds), rough.rounds[0]["vertex_change_px"]
     words = f"views moved the hull by {shift:.2f} px"
@@ -87,12 +91,24 @@ def shaped(
     else:
         found, more = in_turn(capture, grid, rough, settings, of_turn, progress, words)
         rounds += more
-    if found.rounds[-1]["residual"] > POOR_FIT or not all(one.fusions for one in of_turn.rounds):
+    if not (tells_of_hollows(capture, found) and all(one.fusions for one in of_turn.rounds)):
         return found, rounds
     for dig in (hollowed, pitted):
         found, more = dig(capture, grid, found, settings, of_turn, progress)
         rounds += more
     return found, rounds
+
+
+def tells_of_hollows(capture: Capture, found: Refined) -> bool:
+    """Whether the model fits so well that where it does not a hollow is likely."""
+    import numpy as np
+
+    from mvps.hollows import beyond_noise
+    from mvps.material import POOR_FIT
+    from mvps.noise import samples_noise
+
+    left = float(np.nanmedian(beyond_noise(found.unexplained, samples_noise(capture))))
+    return found.rounds[-1]["residual"] <= POOR_FIT and left <= SIGNS * POOR_FIT
 
 
 def in_turn(

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from sphere_scene import make_sphere
 
-from mvps.coarse import begin
+from mvps.coarse import begin, tells_of_hollows
 from mvps.digging import MOST_TURNS, hollowed, pitted
 from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, mean_depth, misfit, pits, solid, thickness
 from mvps.hull import visual_hull
@@ -257,6 +257,16 @@ def vessel(settings: SceneSettings) -> Scene:
     placed = vertices * settings.extent / 2
     cameras = make_cameras(settings, placed)
     return Scene(Surface(placed, surface.faces), material, cameras, make_lights(settings, cameras, light_rng))
+
+
+@pytest.mark.parametrize(("left", "noise", "told"), [(0.05, 0.0, True), (0.09, 0.0, False), (0.09, 0.07, True), (0.11, 0.1, False)])
+def test_where_little_fits_no_misfit_is_a_sign(left: float, noise: float, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is left of most vertices is the model's fault, unless it is noise; and of a model that fits badly with its noise nothing is."""
+    monkeypatch.setattr("mvps.noise.samples_noise", lambda _: noise)
+    unexplained = np.array([left, left, left, 0.9, np.nan])
+    found: Any = SimpleNamespace(unexplained=unexplained, rounds=[{"residual": 0.5}, {"residual": left}])
+    capture: Any = None
+    assert tells_of_hollows(capture, found) is told
 
 
 def test_a_vessel_is_hollow() -> None:
