@@ -30,6 +30,8 @@ CASES: dict[str, tuple[str, list[str]]] = {
     **{f"armadillo, view {view}": ("armadillo", ["--views", str(view)]) for view in (1, 7)},
     **{f"spot, view {view}": ("spot", ["--views", str(view)]) for view in (1, 8)},
     **{f"buddha, view {view}": ("buddha", ["--views", str(view)]) for view in (1, 7)},
+    **{f"{name}, given lights": (name, ["--calibrated-lights"]) for name in ("ball", "bear")},
+    **{f"buddha, view {view}, given lights": ("buddha", ["--views", str(view), "--calibrated-lights"]) for view in (1, 7)},
 }
 """Name: capture, and options of mvps.reconstruct, or for made ones of mvps.synthetic."""
 

@@ -54,11 +54,17 @@ def shared_variance(view: View, lights: Lights, maps: NormalMap, found: Resolved
     return variance
 
 
+def either(normal: Float, other: Float) -> Float:
+    """(pixels,) variance of a normal along a tangent, radians^2, of normals (pixels, 3) and other ones (pixels, 3) of which either may be
+    right: of the square of their difference half is either's error, and half of that of either tangential component."""
+    variance: Float = ((normal - other) ** 2).sum(1) / 4
+    return variance
+
+
 def disagreement(normal: Float, rough: Float) -> Float:
-    """(pixels,) variance of a normal along a tangent, radians^2, of normals (pixels, 3) where rough ones (pixels, 3) are all that told the
-    lights: of the square of their difference half is either's error, and half of that of either tangential component. One number for all:
-    where two guesses meet, they may both be wrong."""
-    return np.full(len(normal), ((normal - rough) ** 2).sum(1).mean() / 4)
+    """`either` (pixels,) of normals (pixels, 3) where rough ones (pixels, 3) are all that told the lights. One number for all: where two
+    guesses meet, they may both be wrong."""
+    return np.full(len(normal), either(normal, rough).mean())
 
 
 def at_corners(variance: Float, surface: Surface) -> Float:

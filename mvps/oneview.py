@@ -2,14 +2,15 @@
 
 factorisation -> 3 x 3 ambiguity (relief/ambiguity.py) -> photometric stereo -> rounds of bas-relief, integration and Stage II
 (joint/one_view.py), each but the first from the ambiguity on, without highlights -> the same result as of many views.
-Where nothing resolves the ambiguity, lights are those under the inflated silhouette's normals, from which the rounds start.
+Where nothing resolves the ambiguity, lights are those under the inflated silhouette's normals. There, and on metals under given lights,
+rounds start from the normals of exemplars (exemplars.py).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -170,28 +171,54 @@ def without_misfits(capture: Capture, lights: Lights, device: Device) -> tuple[C
     return capture.without({view.name: wrong}), [Finding("photograph", f"{view.name}/{n:03d}", words, True) for n in wrong]
 
 
+class Beginning(NamedTuple):
+    """What rounds begin with: used, the capture less photographs that were left out (misfits); maps, photometric stereo of its view, shiny:
+    by exemplars, for it is of metal or the like."""
+
+    used: Capture
+    maps: NormalMap
+    misfits: list[Finding]
+    shiny: bool
+
+
+def beginning(used: Capture, lights: Lights, resolved: bool, given: bool, rough: Float, device: Device) -> Beginning:
+    """Normals of the capture's only view under its first lights: given ones, ones that Lambert's law resolved, or its silhouette's, which
+    are taken where that law says nothing of the photographs. rough (pixels, 3): the silhouette's normals, for pixels of too few values."""
+    from mvps.exemplars import is_shiny, with_exemplars
+    from mvps.photometric import normal_maps
+
+    under = used.views[0], lights.direction[0], lights.intensity[0]
+    maps = normal_maps(used, lights, device)[0]
+    # No photograph of metals can be told to be wrong by that law.
+    if not (resolved or given):
+        return Beginning(used, with_exemplars(*under, of_silhouette(maps, rough, used.views[0]), device, True), [], True)
+    if given and is_shiny(*under, device):
+        return Beginning(used, with_exemplars(*under, maps, device, False), [], True)
+    kept, misfits = without_misfits(used, lights, device)
+    return Beginning(kept, normal_maps(kept, lights, device)[0] if misfits else maps, misfits, False)
+
+
 def refined_from(
     used: Capture, lights: Lights, found: Resolved | None, solved: bool, rough: Float, settings: Settings, parts: Parts, progress: Progress
 ) -> tuple[Refined, Capture, list[Finding]]:
     """Stage II of the only view of `used` under its first lights, what it was made from, and photographs that were left out.
 
-    found: what resolved the lights; None where they are the silhouette's (solved), from whose rough normals (pixels, 3) rounds then start,
-    or given ones (not solved).
+    found: what resolved the lights; None where they are those under the rough normals (pixels, 3) of its silhouette (solved), or given ones
+    (not solved).
     """
     from mvps.device import chosen_device
-    from mvps.jackknife import at_corners, disagreement, shared_variance
+    from mvps.exemplars import BY_EXEMPLARS
+    from mvps.jackknife import at_corners, disagreement, either, shared_variance
     from mvps.joint.one_view import ROUNDS, Start, refine_view
     from mvps.joint.refine import RefineSettings
     from mvps.photometric import normal_maps
 
     device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
-    distance, untold = distance_of(view)[0], solved and found is None
+    distance = distance_of(view)[0]
     with progress.stage("photometric stereo") as stage:
-        # Under lights that are the silhouette's alone no photograph can be told to be wrong, and Lambert's normals are worse than its own.
-        used, misfits = (used, []) if untold else without_misfits(used, lights, device)
-        maps = normal_maps(used, lights, device)[0]
-        start = Start(lights, of_silhouette(maps, rough, view) if untold else maps, found)
-        stage.status(f"{len(misfits)} photographs left out" if misfits else "")
+        used, maps, misfits, shiny = beginning(used, lights, found is not None, not solved, rough, device)
+        start = Start(lights, maps, found)
+        stage.status("; ".join([f"{len(misfits)} photographs left out"] * bool(misfits) + [BY_EXEMPLARS] * shiny))
     # Where the model does not fit, rounds turn the silhouette's lights away.
     plan = parts.of(RefineSettings((), free_lights=found is not None, final=True))
     with progress.stage("joint refinement", total=rounds) as stage:
@@ -203,17 +230,21 @@ def refined_from(
             return surface_of(view, normal, confidence, distance)
 
         def again(matt: View, before: Lights, maps: NormalMap) -> Start[Resolved | None]:
-            if untold:
+            if shiny:
                 return Start(before, maps, None)
             lights, anew = (before, None) if found is None else lights_again(matt, before, rough, settings.seed)
             return Start(lights, normal_maps(replace(used, views=(matt,)), lights, device)[0], anew)
 
         refined, start = refine_view(used, start, again, parts.law(), plan, rounds, settings.seed, device, integrated, on_round)
-        if solved:
-            if start.resolved is None:
-                shared = disagreement(refined.maps[0].normal @ view.camera.rotation.T, rough)
-            else:
-                shared = shared_variance(used.views[0], start.lights, start.maps, start.resolved, parts.law(), settings.seed, device)
+        own, resolved, shared = refined.maps[0].normal.astype(np.float64), start.resolved, None
+        if resolved is not None:
+            shared = shared_variance(used.views[0], start.lights, start.maps, resolved, parts.law(), settings.seed, device)
+        elif solved:
+            shared = disagreement(own @ view.camera.rotation.T, rough)
+        elif shiny:
+            # No other view contradicts what is taken for lobes.
+            shared = either(own, maps.normal)
+        if shared is not None:
             confidence = less_confident(refined.material.confidence, at_corners(shared, refined.surface))
             refined = replace(refined, material=replace(refined.material, confidence=confidence))
         undone = len(refined.rounds) + 1

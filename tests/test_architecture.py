@@ -27,6 +27,7 @@ TORCH_ROOMS = (
     "neural",
     "rendering",
     "photometric",
+    "exemplars",
     "occupancy",
     "radiance",
     "fieldtraining",

@@ -168,10 +168,11 @@ def test_where_photographs_do_not_tell_lights_the_silhouette_does(captures: Path
 
 
 def test_one_view_of_metal_keeps_the_lights_that_its_silhouette_tells(captures: Path, tmp_path: Path) -> None:
-    """Rounds that resolve a bas-relief by lobes which are not understood put lights 60 deg off and more."""
+    """Rounds that resolve a bas-relief by lobes which are not understood put lights 60 deg off and more. Under lights that are 12 deg off
+    the silhouette's own normals are 36 deg off, and rounds from them came to 27."""
     reconstruct_main([str(captures / "buddha"), "--views", "1", "--out", str(tmp_path / "result"), "--preset", "draft", "--quiet"])
     errors = evaluate_result(tmp_path / "result", captures / "buddha")
-    assert errors["light_error_deg"] < 20 and errors["map_normal_error_deg"] < 40
+    assert errors["light_error_deg"] < 20 and errors["map_normal_error_deg"] < 22
     metrics = (tmp_path / "result" / "metrics.json").read_text()
     assert "do not tell the lights" in metrics and "poor fit" in metrics
 
@@ -188,10 +189,15 @@ def test_lights_that_rounds_turn_far_away_are_the_silhouettes(made: tuple[Captur
     assert "do not tell the lights" in found.metrics["status"]["text"]
 
 
-@pytest.mark.parametrize(("name", "normals"), [("ball", 2.5), ("bear", 5.5)])
-def test_photographs_under_given_lights(captures: Path, tmp_path: Path, name: str, normals: float) -> None:
-    reconstruct_main([str(captures / name), "--out", str(tmp_path / "result"), "--calibrated-lights", "--quiet"])
-    assert evaluate_result(tmp_path / "result", captures / name)["map_normal_error_deg"] < normals
+@pytest.mark.parametrize(
+    ("name", "options", "normals"), [("ball", [], 2.5), ("bear", [], 5.5), ("buddha", ["--views", "7", "--preset", "draft"], 12)]
+)
+def test_photographs_under_given_lights(captures: Path, tmp_path: Path, name: str, options: list[str], normals: float) -> None:
+    """buddha is of gold paint: 39 deg off without exemplars, for Lambert's law is 42 deg off."""
+    reconstruct_main([str(captures / name), "--out", str(tmp_path / "result"), "--calibrated-lights", "--quiet", *options])
+    errors = evaluate_result(tmp_path / "result", captures / name)
+    assert errors["map_normal_error_deg"] < normals
+    assert ("exemplars" in (tmp_path / "result" / "metrics.json").read_text()) is (name == "buddha")
 
 
 def test_photographs_that_fit_no_surface_are_left_out(made: tuple[Capture, Truth]) -> None:
