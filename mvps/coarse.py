@@ -91,7 +91,7 @@ def shaped(
     else:
         found, more = in_turn(capture, grid, rough, settings, of_turn, progress, words)
         rounds += more
-    if not (tells_of_hollows(capture, found) and all(one.fusions for one in of_turn.rounds)):
+    if not (all(one.fusions for one in of_turn.rounds) and tells_of_hollows(capture, found)):
         return found, rounds
     for dig in (hollowed, pitted):
         found, more = dig(capture, grid, found, settings, of_turn, progress)
