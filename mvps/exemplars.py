@@ -39,7 +39,7 @@ from mvps.shading import against, gain, half_dot_normal, half_length, lobe
 Ask = Callable[[Tensor, Tensor, Tensor, list[Tensor]], Tensor]
 """Of values, whether they are usable, normals and their exemplars."""
 
-BY_EXEMPLARS = "where Lambert's law fits badly by exemplars with lobes"
+BY_EXEMPLARS = "normals by exemplars with lobes"
 """How normals were found, for the account."""
 
 NORMALS = 2000

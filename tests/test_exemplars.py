@@ -12,8 +12,9 @@ from mvps.camera import pixel_centres, rays
 from mvps.exemplars import FEWEST, is_shiny, matched, misfit, with_exemplars
 from mvps.material import POOR_FIT
 from mvps.mesh import angles_deg, normalise
+from mvps.oneview import beginning, without_misfits
 from mvps.photometric import normal_map
-from mvps.scene import Camera, NormalMap, View, expected_error_deg
+from mvps.scene import Camera, Capture, Lights, NormalMap, View, expected_error_deg
 
 SIZE, LIGHTS, CPU = 40, 16, torch.device("cpu")
 RNG = np.random.default_rng(0)
@@ -109,3 +110,15 @@ def test_black_clipped_and_unlit_pixels_are_finite() -> None:
     for values in (found.normal, found.albedo, found.confidence):
         assert np.isfinite(values).all()
     assert (found.normal[:3] == by_lambert.normal[:3]).all() and (found.confidence[:3] == by_lambert.confidence[:3]).all()
+
+
+def test_no_photograph_of_metal_is_left_out_for_not_being_lamberts() -> None:
+    """Under given lights that law would leave some out; and chalk keeps its normals."""
+    rough = np.tile([0.0, 0.0, -1.0], (SIZE**2, 1))
+    lights = Lights((DIRECTION,), (INTENSITY,), False)
+    metal, chalk = (Capture("patches", (photographed(kind),)) for kind in (METAL, CHALK))
+    assert without_misfits(metal, lights, CPU)[1]
+    begun = beginning(metal, lights, False, True, rough, CPU)
+    assert begun.shiny and not begun.misfits and len(begun.used.views[0].lights) == LIGHTS
+    begun = beginning(chalk, lights, False, True, rough, CPU)
+    assert not begun.shiny and (begun.maps.normal == normal_map(chalk.views[0], DIRECTION, INTENSITY, CPU).normal).all()
