@@ -17,10 +17,11 @@ from mvps import cores, memory, reconstruct
 from mvps.command import run
 from mvps.cores import at_a_time, on_cores, one_by_one, work_on
 from mvps.joint.blocks import Vertices
+from mvps.joint.lighting import FEWER_VERTICES, LIGHT_VERTICES, MOST_TOGETHER, vertices_for
 from mvps.joint.state import State, senders_of
 from mvps.load import read_capture
 from mvps.material import LARGEST
-from mvps.memory import keep_below, likely_vertices, peak_bytes, room_for, solved_together
+from mvps.memory import Together, keep_below, likely_vertices, peak_bytes, room_for, solved_together
 from mvps.scene import CaptureError, Lights
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
@@ -79,10 +80,10 @@ def test_lights_of_their_own_take_room() -> None:
     """Where those of 20 views are solved for together: 1.35 GB, measured 1.4."""
     vertices = likely_vertices(SIZES, "draft")
     keep_below((peak_bytes(PROGRAM, SIZES, vertices, 2) + 1e6) / 1e9, PROGRAM, SIZES, "draft")
-    room_for(vertices, lights=96)
+    room_for(vertices, together=Together(96, LIGHT_VERTICES))
     assert at_a_time() == 2
     with pytest.raises(CaptureError, match="of up to 96 lights whose 1920 lights are solved for together and a mesh") as refused:
-        room_for(vertices, lights=1920)
+        room_for(vertices, together=Together(1920, LIGHT_VERTICES))
     more = float(str(refused.value).split("at least ")[1].split()[0]) - peak_bytes(PROGRAM, SIZES, 0, 1) / 1e9
     assert abs(more - 1.35) < 0.1
 
@@ -92,6 +93,25 @@ def test_lights_of_one_rig_are_the_same_in_all_views(one_rig: bool, together: in
     towards = np.array([[0.0, 0.0, 1.0]])
     lights = Lights(tuple(towards.repeat(n, 0) for n in (3, 2)), tuple(np.ones((n, 3)) for n in (3, 2)), one_rig)
     assert solved_together(lights, 0) == together and solved_together(lights, 4) == together + 2
+
+
+def _lights(views: int, count: int, one_rig: bool) -> Lights:
+    towards = np.tile([[0.0, 0.0, 1.0]], (count, 1))
+    return Lights((towards,) * views, (np.ones((count, 3)),) * views, one_rig)
+
+
+@pytest.mark.parametrize(
+    ("views", "count", "one_rig", "times"), [(20, 32, True, 1), (5, 7, True, 1), (5, 7, False, 5), (12, 12, False, 4), (20, 96, False, 1)]
+)
+def test_lights_that_a_view_has_to_itself_are_solved_on_more_vertices(views: int, count: int, one_rig: bool, times: int) -> None:
+    """While these take no more room than MOST_TOGETHER do on as many as a rig's."""
+    lights = _lights(views, count, one_rig)
+    assert vertices_for(lights, True, False) == times * LIGHT_VERTICES and vertices_for(lights, True, True) == times * FEWER_VERTICES
+    assert vertices_for(lights, False, False) == LIGHT_VERTICES
+    together = Together(solved_together(lights, 0), vertices_for(lights, True, False))
+    beside = peak_bytes(PROGRAM, SIZES, 0, 1)
+    most = max(together.lights, MOST_TOGETHER) * LIGHT_VERTICES * memory.LIGHT + together.lights**2 * memory.PAIR
+    assert peak_bytes(PROGRAM, SIZES, 1e4, 1, together=together) - beside <= max(most, 1e4 * memory.VERTEX)
 
 
 def test_light_by_way_of_lobes_takes_room() -> None:
@@ -172,8 +192,14 @@ def test_what_sends_light_on_makes_no_room_that_lights_need(monkeypatch: pytest.
     monkeypatch.setattr("mvps.joint.state.room_for", lambda *of: asked.append(of))
     scene = make_sphere(2)
     state = State(
-        scene.reconstruction.surface, scene.reconstruction.lights, (), scene.reconstruction.material.law, LARGEST, 0.0, together=960
+        scene.reconstruction.surface,
+        scene.reconstruction.lights,
+        (),
+        scene.reconstruction.material.law,
+        LARGEST,
+        0.0,
+        together=Together(960, LIGHT_VERTICES),
     )
     n = len(state.surface.vertices)
     senders_of(state, Vertices(torch.zeros(n, 3), torch.ones(n, 2), torch.ones(n)))
-    assert asked == [(n, 0, 960)]
+    assert asked == [(n, 0, (960, LIGHT_VERTICES))]

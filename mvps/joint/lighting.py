@@ -29,6 +29,9 @@ LIGHT_VERTICES = 4000
 FEWER_VERTICES = 2000
 """The same on the way, under photographs that abound."""
 
+MOST_TOGETHER = 640
+"""Twenty views' 32: solved for together with LIGHT_VERTICES they take a fifth of a GB (memory.py), and a second and a half a round."""
+
 LIGHT_STEPS = 3
 """Gauss-Newton steps a round: near a minimum steps at least halve (refine.py)."""
 
@@ -58,6 +61,15 @@ def of_one_normal(surface: Surface, normal: torch.Tensor, pixel: float, sharpest
         total.index_add_(0, end, change)
         count.index_add_(0, end, torch.ones_like(change))
     return 1 / (1 + sharpest * (total / count.clamp_min(1)))
+
+
+def vertices_for(lights: Lights, free_lights: bool, eased: bool) -> int:
+    """How many vertices, in patches, stand for all in a round that solves the lights, or the law alone. Of lights that a view has to itself
+    only vertices that it sees tell: as many times more as there are views, while all their lights together are not too many."""
+    some = FEWER_VERTICES if eased else LIGHT_VERTICES
+    if lights.one_rig or not free_lights:
+        return some
+    return some * max(1, min(len(lights.direction), MOST_TOGETHER // sum(map(len, lights.direction))))
 
 
 class _Solved(NamedTuple):
@@ -123,8 +135,8 @@ def solved_lights(
         unknown = needed(told, len(found.lights[0].intensity), least)
         if unknown <= (found.strengths.unknown if found.strengths else 0):
             break
-        together = solved_together(state.lights, unknown * len(lights))
-        room_for(len(state.surface.vertices), lights=together)
+        together = state.together._replace(lights=solved_together(state.lights, unknown * len(lights)))
+        room_for(len(state.surface.vertices), together=together)
         # Lights that were solved as if all were as bright are solved again, from farther off than a round's steps begin.
         trial = stepped(found._replace(strengths=replace(found.strengths or as_bright(found.lights), unknown=unknown)), 2 * LIGHT_STEPS)
         then = told_of(trial)

@@ -21,7 +21,7 @@ from mvps.joint.blocks import Vertices
 from mvps.joint.choosing import count_lobes, of_chosen_model
 from mvps.joint.fused import vertex_maps
 from mvps.joint.grey import grey_lights, tensor32
-from mvps.joint.lighting import FEWER_VERTICES, LIGHT_TIE, LIGHT_VERTICES, solved_lights, with_bounce, with_colours
+from mvps.joint.lighting import LIGHT_TIE, solved_lights, vertices_for, with_bounce, with_colours
 from mvps.joint.observe import ViewSamples, observe
 from mvps.joint.patches import drawn_patches
 from mvps.joint.pixels import all_pixel_normals
@@ -165,7 +165,7 @@ def photometric_round(
     if again is not None:
         return _vertices_again(state, capture, carried, device, again)
     (part, part_lights), vertices, seen = _seen_anew(state, capture, carried, device)
-    some = FEWER_VERTICES if task.eased else LIGHT_VERTICES
+    some = vertices_for(state.lights, task.free_lights, task.eased)
     patches = drawn_patches(seen, state.surface, mesh_normal, some, generator, device)
     few = state.views
     if part is not capture:

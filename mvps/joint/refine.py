@@ -24,7 +24,7 @@ from mvps.joint.colours import LobeColour, colours, lobes_in_colour
 from mvps.joint.detail import detailed, interpolated
 from mvps.joint.fused import face_targets
 from mvps.joint.grey import grey_lights
-from mvps.joint.lighting import drawn
+from mvps.joint.lighting import drawn, vertices_for
 from mvps.joint.neural import neural_residual
 from mvps.joint.observe import channel_ratio, visible_in
 from mvps.joint.onward import MOST_GOES_ON, Moves, carried_on
@@ -39,7 +39,7 @@ from mvps.joint.strengths import unknown_of
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
-from mvps.memory import room_for, solved_together
+from mvps.memory import Together, room_for, solved_together
 from mvps.mesh import edges, isotropic_remesh, split_edges, unbiased, vertex_normals
 from mvps.noise import dark_noise_share, samples_noise
 from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface
@@ -246,7 +246,8 @@ def refine(
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     pixel = surface_pixel(capture, surface)
-    together = solved_together(lights, unknown_of(lights)) if settings.free_lights else 0
+    along = vertices_for(lights, settings.free_lights, settings.eased)
+    together = Together(solved_together(lights, unknown_of(lights)) if settings.free_lights else 0, along)
     state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), lobed=law.gleam > 0, together=together)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
@@ -256,7 +257,7 @@ def refine(
         round_settings = pending.pop(0)
         if not isinstance(last, Moves):
             state.surface, creased = _remeshed(state.surface, round_settings, before, carried, pixel)
-        room_for(len(state.surface.vertices), lights=state.together)
+        room_for(len(state.surface.vertices), together=state.together)
         if np.isfinite(round_settings.crease) and creased <= MOSTLY:
             pending = [later for later in pending if not later.for_detail]
         mesh_normal = vertex_normals(state.surface)

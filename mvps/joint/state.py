@@ -15,7 +15,7 @@ from mvps.joint.blocks import Vertices
 from mvps.joint.observe import ViewSamples, with_gathered
 from mvps.joint.steps import confidence
 from mvps.material import Model, Trial
-from mvps.memory import room_for
+from mvps.memory import NONE_TOGETHER, Together, room_for
 from mvps.mesh import normalise, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, NormalMap, Surface
 
@@ -24,7 +24,7 @@ from mvps.scene import Capture, CaptureError, Float, Law, Lights, Material, Norm
 class State:
     """What one round hands to the next. noise: of dark pixels (noise.py); under: the photographs, perhaps thinned, that `views` are samples
     of, and their lights; lobed: whether lobes take part in inter-reflection (gleam.py); gathers: what sends light on, without lobes and
-    with them, once a round asks for it; together: lights, and strengths, that are solved for at once (memory.py)."""
+    with them, once a round asks for it; together: lights and strengths that are solved for at once, along with vertices (memory.py)."""
 
     surface: Surface
     lights: Lights
@@ -38,7 +38,7 @@ class State:
     views: list[ViewSamples] = field(default_factory=list)
     under: tuple[Capture, Lights] | None = None
     trials: list[Trial] = field(default_factory=list)
-    together: int = 0
+    together: Together = NONE_TOGETHER
 
 
 def senders_of(state: State, vertices: Vertices) -> Senders | None:
