@@ -140,6 +140,17 @@ def test_lights_colours_are_found_beside_lobes_of_another_colour_than_the_body(t
     assert np.abs(white_on_average(found) / white_on_average(ratios[0]) - 1).mean() < 0.001
 
 
+def test_a_metal_tells_the_colours_of_lights_that_a_view_has_to_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gold without a body: nothing was told by bodies alone, and all such lights came out white, which they are 16 % off in the mean."""
+    monkeypatch.setattr("sphere_scene.colours", lambda points: np.zeros_like(points))
+    of, ratios, _ = observed(GOLD)
+    of = of._replace(vertices=replace(of.vertices, scale=0.1 * of.vertices.reflectance[:, 1]))
+    found = white_on_average(np.concatenate(light_ratios(of, [np.ones_like(ratio) for ratio in ratios], False)))
+    true = white_on_average(np.concatenate(ratios))
+    assert np.abs(true - 1).mean() > 0.1
+    assert np.abs(found / true - 1).mean() < 0.005
+
+
 def white_on_average(ratio: np.ndarray) -> np.ndarray:
     """Ratios (lights, 3) without a tint that all lights have in common."""
     white = ratio / ratio.mean(0)

@@ -26,9 +26,11 @@ solved in turn with these two, as ratios of robust sums over what is predicted,
 
     r_lc = sum w radiance_c (a_c q + t_c S) / sum w (a_c q + t_c S)^2,     w = (diffuse part / all)^2   on top of the robust weights
 
-because lobes may have other colours still. One factor per channel is free where all has the body's colour. Lights as such are taken for
-white on average, of which n have a mean r of one within sigma / sqrt(n), sigma their own scatter. Highlights of all but metals have the
-colour of their light (Shafer 1985), so that under such lights t is the mean of r, with the variance that the sums above give it,
+because lobes may have other colours still. What one view sees of lights that it has to itself may have no body but what the model's error
+makes up; there POOR_FIT^2 is added to w, so that lobes in their colours tell where bodies make less than that part. One factor per channel
+is free where all has the body's colour. Lights as such are taken for white on average, of which n have a mean r of one within sigma /
+sqrt(n), sigma their own scatter. Highlights of all but metals have the colour of their light (Shafer 1985), so that under such lights t is
+the mean of r, with the variance that the sums above give it,
 
     mean r_c = 1 + (t_c - 1) v / (v + 1 / H_c),   v = sigma^2 / n,   H_c = sum_v H_vc
 
@@ -53,7 +55,7 @@ from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
 from mvps.joint.reflectance import Chunk, Observed, chunks
 from mvps.joint.trial import parted
-from mvps.material import Trial, judged
+from mvps.material import POOR_FIT, Trial, judged
 from mvps.scene import Bool, Float
 from mvps.shading import most_albedo
 
@@ -232,6 +234,7 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
     """Per view the lights' channel ratios (lights, 3), from `ratios` on. All samples are kept meanwhile: those of some thousand vertices
     are enough."""
     kept = on_cores(lambda i: list(chunks(of, i)), range(len(of.views)))
+    least = 0.0 if one_rig else POOR_FIT**2
 
     def sweep(ratios: list[Float]) -> list[Float]:
         sums = _sums(of, ratios, kept.__getitem__)
@@ -239,7 +242,7 @@ def light_ratios(of: Observed, ratios: list[Float], one_rig: bool) -> list[Float
         tints = _tints(sums, tint)
         albedo = _albedo(sums, tints)
         albedo, tints = np.where(_possible(of, sums, albedo), (albedo, tints), 0)
-        solved = _white(_ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tints), range(len(kept))), one_rig))
+        solved = _white(_ratios(on_cores(lambda i: _of_lights(kept[i], len(ratios[i]), albedo, tints, least), range(len(kept))), one_rig))
         # The tint is that under lights which were perhaps not white on average.
         under = np.concatenate(ratios).mean(0)
         mean = _mean_colour(solved[0] if one_rig else np.concatenate(solved), under * tint, under**2 * variance)
@@ -269,12 +272,12 @@ def _mean_colour(ratios: Float, tint: Float, variance: Float) -> Float:
     return np.asarray(1 + beyond * chance / np.maximum(chance + certain, TINY))
 
 
-def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float) -> tuple[Float, Float]:
-    """Numerators and denominators of r (count, 3) of a view's samples, for albedo and the lobes' colour (V, 3)."""
+def _of_lights(of_view: Iterable[Chunk], count: int, albedo: Float, tint: Float, least: float = 0.0) -> tuple[Float, Float]:
+    """Numerators and denominators of r (count, 3) of a view's samples, for albedo and the lobes' colour (V, 3); least: added to w."""
     top, bottom = np.zeros((2, count, 3))
     body, lobes = albedo.astype(np.float32), tint.astype(np.float32)
     for chunk in of_view:
-        weight = chunk.weight * (chunk.diffuse / np.maximum(chunk.predicted, 1e-12)) ** 2
+        weight = chunk.weight * ((chunk.diffuse / np.maximum(chunk.predicted, 1e-12)) ** 2 + least)
         shown = chunk.basis[..., None] * body[chunk.rows, None] + (chunk.predicted - chunk.diffuse)[..., None] * lobes[chunk.rows, None]
         weighted = weight[..., None] * shown
         top += np.einsum("plc,plc->lc", weighted, chunk.image)
