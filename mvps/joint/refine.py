@@ -226,6 +226,12 @@ def _in_detail(result: Refined, capture: Capture, told: Moved, seen: list[Any]) 
     return replace(result, surface=finer.surface, material=material, unexplained=unexplained)
 
 
+def _together(lights: Lights, settings: RefineSettings) -> Together:
+    """What the equations of the lights have, which may all be known."""
+    unknown = solved_together(lights, unknown_of(lights)) if settings.free_lights else 0
+    return Together(unknown, vertices_for(lights, settings.free_lights, settings.eased))
+
+
 def refine(
     capture: Capture,
     surface: Surface,
@@ -246,9 +252,8 @@ def refine(
     generator = np.random.default_rng(seed)
     torch.set_num_threads(1)
     pixel = surface_pixel(capture, surface)
-    along = vertices_for(lights, settings.free_lights, settings.eased)
-    together = Together(solved_together(lights, unknown_of(lights)) if settings.free_lights else 0, along)
-    state = State(surface, lights, maps, law, settings.model, dark_noise_share(capture), lobed=law.gleam > 0, together=together)
+    noise, together = dark_noise_share(capture), _together(lights, settings)
+    state = State(surface, lights, maps, law, settings.model, noise, lobed=law.gleam > 0, together=together)
     account: list[dict[str, float]] = []
     before, pending = None, list(settings.rounds)
     last: Moves | float = settings.goes_on
