@@ -6,11 +6,12 @@ normals, masks and smoothness made. Of the means p + a (m - p) the one nearest t
     a = E[(p - t) . (p - m)] / E|p - m|^2
 
 (James and Stein 1961; Stone 1974 for other data in the truth's place). The truth is not known, but other views' pixels err about it on
-their own: in its place stands the mean r of what the nearest views show there. Of each view's error, with the variance V, m holds a part
-s where n views, effectively, show a place, n = (sum w)^2 / sum w^2. So (p - r) . (p - m) has V in the mean, where (p - t) . (p - m) has
-V (1 - s), and
+their own: in its place stands the mean r of what the nearest views show there. They show it between their pixels, blurred, and detail
+that r has lost would count as p's error: so r is held against Bp, own normals blurred as much. Of each view's error, with the variance V,
+m holds a part s where n views, effectively, show a place, n = (sum w)^2 / sum w^2. So (Bp - r) . (p - m) has b V in the mean, b the weight
+of a pixel in its own blurred value, where (p - t) . (p - m) has V (1 - s), and
 
-    a = (1 - s) E[(p - r) . (p - m)] / E|p - m|^2,      between 0 and 1,      s = 1 / n^2
+    a = (1 - s) E[(Bp - r) . (p - m)] / (b E|p - m|^2),      between 0 and 1,      s = 1 / n^2
 
 with means over the vertices around. A surface that followed the mean of n normals at its place would hold 1 / n, one that is a mean over
 many pixels around, and lies where views agree, next to nothing; the square of the former stands between (docs/findings/normals.md). Where
@@ -33,8 +34,15 @@ from mvps.silhouette import sampled
 from mvps.texel_normals import Places, around
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster, visible_vertices
 
-OTHERS = 3
-"""Views beside a pixel's own that are asked: they show the same places, and with three r errs by little more than with all."""
+OTHERS = 4
+"""Views beside a pixel's own that are asked: they show the same places, and r errs by little more than with all, of which far ones blur
+more (docs/findings/normals.md)."""
+
+ASLANT = 0.5
+"""Least squared cosine at which another view shows a place, over the pixel's own: at a half its pixels are 1.4 times as long there."""
+
+BETWEEN = np.array([1, 10, 1]) / 12
+"""B along either axis: linear interpolation spreads by u (1 - u) square pixels a part u of the way to the next pixel, 1/6 in the mean."""
 
 WHOLE = 0.99
 """Of a bilinear value, the part that must come from pixels with normals."""
@@ -43,11 +51,13 @@ Picture = NDArray[np.float32]
 
 
 class _Shown(NamedTuple):
-    """Of a view's n pixels: own (n, 3) normals, 0 where not known; surface's (n, 3), and its points (n, 3), 0 where it is missed; hits.
-    picture: the own ones with ones beside them (height, width, 4), 0 where not known. sees (V,): whether it sees a vertex."""
+    """Of a view's n pixels: own (n, 3) normals, 0 where not known, and blurred by B; surface's (n, 3), and its points (n, 3), 0 where it
+    is missed; hits. picture: the own ones with ones beside them (height, width, 4), 0 where not known. sees (V,): whether it sees a
+    vertex."""
 
     view: View
     own: Float
+    blurred: Float
     mesh: Float
     point: Float
     hits: Hits
@@ -86,20 +96,24 @@ def _shown(caster: RayCaster, view: View, picture: Picture) -> _Shown:
     hits = camera_hits(caster, view.camera, view.pixels)
     mesh, point = normalise(interpolate(surface, hits, caster.vertex_normals)), interpolate(surface, hits, surface.vertices)
     own = normals[view.mask][:, :3].astype(float)
-    return _Shown(view, own, mesh, point, hits, normals, visible_vertices(caster, view.camera))
+    around_it = cv2.sepFilter2D(normals, -1, BETWEEN, BETWEEN, borderType=cv2.BORDER_CONSTANT)[view.mask].astype(float)
+    blurred = around_it[:, :3] / np.maximum(around_it[:, 3:], np.finfo(float).tiny)
+    return _Shown(view, own, blurred, mesh, point, hits, normals, visible_vertices(caster, view.camera))
 
 
 def _products(surface: Surface, of: _Shown, others: list[_Shown]) -> tuple[Float, Float]:
-    """(n, 2) (p - r) . (p - m) and |p - m|^2 of a view's pixels, and (n,) their weight, 0 where no other view shows the place."""
+    """(n, 2) (Bp - r) . (p - m) / b and |p - m|^2 of a view's pixels, and (n,) their weight, 0 where no other view shows the place."""
     corners, total = surface.faces[of.hits.face.clip(0)], np.zeros_like(of.own)
+    facing = _facing(of.view, of.mesh, of.point)
     for other in others:
         seen = np.flatnonzero((of.hits.face >= 0) & other.sees[corners].all(1))
         found = sampled(other.picture, project(other.view.camera, of.point[seen])[0], cv2.BORDER_CONSTANT)
-        weight = (found[:, 3] > WHOLE) * _facing(other.view, of.mesh[seen], of.point[seen])
+        weight = _facing(other.view, of.mesh[seen], of.point[seen])
+        weight *= (found[:, 3] > WHOLE) & (weight >= ASLANT * facing[seen])
         total[seen] += normalise(found[:, :3].astype(float)) * weight[:, None]
     away, told = of.own - of.mesh, (total != 0).any(1) & (of.own != 0).any(1)
-    products = np.stack([((of.own - normalise(total)) * away).sum(1), (away**2).sum(1)], 1)
-    return products, told * _facing(of.view, of.mesh, of.point)
+    apart = (of.blurred - normalise(total)) / BETWEEN[1] ** 2
+    return np.stack([(apart * away).sum(1), (away**2).sum(1)], 1), told * facing
 
 
 def _drawn(of: _Shown, picture: Picture, part: Float) -> Picture:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sphere_scene import SphereScene, make_sphere
 
+from mvps.camera import surface_pixel
 from mvps.mesh import angles_deg, normalise, vertex_normals
 from mvps.scene import Capture, Float, Surface
 from mvps.view_normals import Picture, drawn_to_surface
@@ -59,6 +60,21 @@ def test_detail_that_views_share_and_the_surface_lacks_stays(ball: SphereScene) 
     true = shown(ball.capture, surface, ball.reconstruction.material.normal)
     assert error(shown(ball.capture, surface, vertex_normals(surface)), true) > 4
     assert error(drawn_to_surface(ball.capture, surface, true), true) < 0.1
+
+
+def test_detail_that_other_views_show_blurred_stays(ball: SphereScene) -> None:
+    surface, caster = ball.reconstruction.surface, RayCaster(ball.reconstruction.surface)
+    true = []
+    for view in ball.capture.views:
+        hits = camera_hits(caster, view.camera, view.pixels)
+        smooth, point = (interpolate(surface, hits, values) for values in (vertex_normals(surface), surface.vertices))
+        # Waves of four pixels, which are lower by a third between pixels.
+        picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
+        picture[view.mask] = normalise(smooth + 0.15 * np.sin(2 * np.pi * point / (4 * surface_pixel(ball.capture, surface))))
+        true.append(picture)
+    given = noisy(true, 0.03)
+    assert error(shown(ball.capture, surface, vertex_normals(surface)), true) > 6
+    assert error(drawn_to_surface(ball.capture, surface, given), true) < error(given, true)
 
 
 @pytest.mark.parametrize(("noise", "wrong"), [(0.01, 0.1), (0.02, 0.1), (0.05, 0.05)])
