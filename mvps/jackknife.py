@@ -61,12 +61,6 @@ def either(normal: Float, other: Float) -> Float:
     return variance
 
 
-def disagreement(normal: Float, rough: Float) -> Float:
-    """`either` (pixels,) of normals (pixels, 3) where rough ones (pixels, 3) are all that told the lights. One number for all: where two
-    guesses meet, they may both be wrong."""
-    return np.full(len(normal), either(normal, rough).mean())
-
-
 def at_corners(variance: Float, surface: Surface) -> Float:
     """(V,) values of the pixels (n,) at the corners of their quads (relief/surface.py): means over the faces around."""
     corners, of_faces = surface.faces.ravel(), np.repeat(np.tile(variance, 2), 3)

@@ -2,8 +2,9 @@
 
 factorisation -> 3 x 3 ambiguity (relief/ambiguity.py) -> photometric stereo -> rounds of bas-relief, integration and Stage II
 (joint/one_view.py), each but the first from the ambiguity on, without highlights -> the same result as of many views.
-Where nothing resolves the ambiguity, lights are those under the inflated silhouette's normals. There, and on metals under given lights,
-rounds start from the normals of exemplars (exemplars.py).
+Where nothing resolves the ambiguity, lights are those under which an object of two materials explains most (two_materials.py), found from
+those under the inflated silhouette's normals. There, and on metals under given lights, rounds start from the normals of exemplars of these
+materials (exemplars.py), and leave the lights.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ WORDS = (
     "One view: the surface is what its normals integrate to, open, of what this camera sees; its distance {distance} and heights of steps"
     " are not known from photographs under distant lights."
 )
-UNTOLD = " Its photographs do not tell the lights, which are what the silhouette tells: ten degrees off, or twenty."
+UNTOLD = " No body tells its lights, which are those under which two materials explain most: three to ten degrees off, or twenty."
 OF_ORIGIN = "is the world origin's"
 FEWEST_LIGHTS = 12
 """From which on trimmed photographs leave enough for normals: nine."""
@@ -98,7 +99,7 @@ def first_lights(capture: Capture, rough: Float, under: Float, seed: int) -> tup
 def words_of(found: Resolved | None) -> str:
     """How the lights of one view were found."""
     if found is None:
-        return "one view, whose photographs do not tell them: from the silhouette's normals"
+        return "one view, of which no body tells them: from the silhouette's normals at first"
     return f"one view; three factors leave {100 * found.pseudo.residual:.1f} % of the images"
 
 
@@ -172,30 +173,40 @@ def without_misfits(capture: Capture, lights: Lights, device: Device) -> tuple[C
 
 
 class Beginning(NamedTuple):
-    """What rounds begin with: used, the capture less photographs that were left out (misfits); maps, photometric stereo of its view, shiny:
-    by exemplars, for it is of metal or the like."""
+    """What rounds begin with: used, the capture less photographs that were left out (misfits); lights, and maps, photometric stereo of its
+    view under them, shiny: by exemplars, for it is of metal or the like; scatter: variance of lights by two materials along a tangent."""
 
     used: Capture
+    lights: Lights
     maps: NormalMap
     misfits: list[Finding]
     shiny: bool
+    scatter: float = 0.0
 
 
-def beginning(used: Capture, lights: Lights, resolved: bool, given: bool, rough: Float, device: Device) -> Beginning:
-    """Normals of the capture's only view under its first lights: given ones, ones that Lambert's law resolved, or its silhouette's, which
-    are taken where that law says nothing of the photographs. rough (pixels, 3): the silhouette's normals, for pixels of too few values."""
+def beginning(used: Capture, lights: Lights, resolved: bool, given: bool, rough: Float, device: Device, seed: int) -> Beginning:
+    """Lights of the capture's only view and its normals under them, from its first lights: given ones, ones that Lambert's law resolved, or
+    its silhouette's, from which those of two materials are found where that law says nothing of the photographs. rough (pixels, 3): the
+    silhouette's normals, for pixels of too few values."""
     from mvps.exemplars import is_shiny, with_exemplars
     from mvps.photometric import normal_maps
+    from mvps.relief.ambiguity import outer_band
+    from mvps.two_materials import lights_by_materials, materials_under
 
-    under = used.views[0], lights.direction[0], lights.intensity[0]
-    maps = normal_maps(used, lights, device)[0]
-    # No photograph of metals can be told to be wrong by that law.
+    view = used.views[0]
+    # No photograph of metals can be told to be wrong by Lambert's law.
     if not (resolved or given):
-        return Beginning(used, with_exemplars(*under, of_silhouette(maps, rough, used.views[0]), device, True), [], True)
+        scaled = lights.direction[0] @ view.camera.rotation.T * lights.intensity[0].mean(1, keepdims=True)
+        scaled, scatter = lights_by_materials(view, scaled, rough, outer_band(view), device, seed)
+        lights = _lights(view, scaled)
+        maps = of_silhouette(normal_maps(used, lights, device)[0], rough, view)
+        under = view, lights.direction[0], lights.intensity[0]
+        return Beginning(used, lights, with_exemplars(*under, materials_under(*under, device), maps, device, True), [], True, scatter)
+    maps, under = normal_maps(used, lights, device)[0], (view, lights.direction[0], lights.intensity[0])
     if given and is_shiny(*under, device):
-        return Beginning(used, with_exemplars(*under, maps, device, False), [], True)
+        return Beginning(used, lights, with_exemplars(*under, materials_under(*under, device), maps, device, False), [], True)
     kept, misfits = without_misfits(used, lights, device)
-    return Beginning(kept, normal_maps(kept, lights, device)[0] if misfits else maps, misfits, False)
+    return Beginning(kept, lights, normal_maps(kept, lights, device)[0] if misfits else maps, misfits, False)
 
 
 def refined_from(
@@ -203,12 +214,12 @@ def refined_from(
 ) -> tuple[Refined, Capture, list[Finding]]:
     """Stage II of the only view of `used` under its first lights, what it was made from, and photographs that were left out.
 
-    found: what resolved the lights; None where they are those under the rough normals (pixels, 3) of its silhouette (solved), or given ones
-    (not solved).
+    found: what resolved the lights; None where they are those under the rough normals (pixels, 3) of its silhouette, from which better ones
+    are found (solved), or given ones (not solved).
     """
     from mvps.device import chosen_device
     from mvps.exemplars import BY_EXEMPLARS
-    from mvps.jackknife import at_corners, disagreement, either, shared_variance
+    from mvps.jackknife import at_corners, either, shared_variance
     from mvps.joint.one_view import ROUNDS, Start, refine_view
     from mvps.joint.refine import RefineSettings
     from mvps.photometric import normal_maps
@@ -216,10 +227,10 @@ def refined_from(
     device, view, rounds = chosen_device(settings.device), used.views[0], ROUNDS[settings.preset]
     distance = distance_of(view)[0]
     with progress.stage("photometric stereo") as stage:
-        used, maps, misfits, shiny = beginning(used, lights, found is not None, not solved, rough, device)
+        used, lights, maps, misfits, shiny, scatter = beginning(used, lights, found is not None, not solved, rough, device, settings.seed)
         start = Start(lights, maps, found)
         stage.status("; ".join([f"{len(misfits)} photographs left out"] * bool(misfits) + [BY_EXEMPLARS] * shiny))
-    # Where the model does not fit, rounds turn the silhouette's lights away.
+    # Rounds bring lights by two materials no nearer.
     plan = parts.of(RefineSettings((), free_lights=found is not None, final=True))
     with progress.stage("joint refinement", total=rounds) as stage:
 
@@ -239,11 +250,9 @@ def refined_from(
         own, resolved, shared = refined.maps[0].normal.astype(np.float64), start.resolved, None
         if resolved is not None:
             shared = shared_variance(used.views[0], start.lights, start.maps, resolved, parts.law(), settings.seed, device)
-        elif solved:
-            shared = disagreement(own @ view.camera.rotation.T, rough)
         elif shiny:
             # No other view contradicts what is taken for lobes.
-            shared = either(own, maps.normal)
+            shared = either(own, maps.normal) + scatter
         if shared is not None:
             confidence = less_confident(refined.material.confidence, at_corners(shared, refined.surface))
             refined = replace(refined, material=replace(refined.material, confidence=confidence))

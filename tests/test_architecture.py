@@ -28,6 +28,7 @@ TORCH_ROOMS = (
     "rendering",
     "photometric",
     "exemplars",
+    "two_materials",
     "occupancy",
     "radiance",
     "fieldtraining",

@@ -15,6 +15,7 @@ from mvps.mesh import angles_deg, normalise
 from mvps.oneview import beginning, without_misfits
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, Lights, NormalMap, View, expected_error_deg
+from mvps.two_materials import materials_under
 
 SIZE, LIGHTS, CPU = 40, 16, torch.device("cpu")
 RNG = np.random.default_rng(0)
@@ -60,7 +61,7 @@ def test_normals_of_metal() -> None:
     view = photographed(METAL)
     assert is_shiny(view, DIRECTION, INTENSITY, CPU)
     by_lambert = normal_map(view, DIRECTION, INTENSITY, CPU)
-    found = with_exemplars(view, DIRECTION, INTENSITY, by_lambert, CPU, all_over=False)
+    found = with_exemplars(view, DIRECTION, INTENSITY, materials_under(view, DIRECTION, INTENSITY, CPU), by_lambert, CPU, all_over=False)
     assert np.median(errors_of(by_lambert, METAL)) > 15
     off = errors_of(found, METAL)
     assert np.median(off) < 5 and off.mean() < 0.3 * errors_of(by_lambert, METAL).mean()
@@ -73,10 +74,12 @@ def test_where_lambert_fits_its_normals_stay() -> None:
     mostly = np.arange(SIZE**2) % 4 > 0
     view = photographed(mostly)
     by_lambert = normal_map(view, DIRECTION, INTENSITY, CPU)
-    found = with_exemplars(view, DIRECTION, INTENSITY, by_lambert, CPU, all_over=False)
+    found = with_exemplars(view, DIRECTION, INTENSITY, materials_under(view, DIRECTION, INTENSITY, CPU), by_lambert, CPU, all_over=False)
     assert (found.normal[~mostly] == by_lambert.normal[~mostly]).all() and (found.albedo[~mostly] == by_lambert.albedo[~mostly]).all()
     assert errors_of(found, mostly).mean() < 0.4 * errors_of(by_lambert, mostly).mean()
-    everywhere = with_exemplars(view, DIRECTION, INTENSITY, by_lambert, CPU, all_over=True)
+    everywhere = with_exemplars(
+        view, DIRECTION, INTENSITY, materials_under(view, DIRECTION, INTENSITY, CPU), by_lambert, CPU, all_over=True
+    )
     assert (everywhere.normal[~mostly] != by_lambert.normal[~mostly]).any(1).all() and errors_of(everywhere, ~mostly).mean() < 5
 
 
@@ -93,8 +96,10 @@ def test_chalk_is_not_shiny_nor_with_a_few_pixels_of_metal() -> None:
 @pytest.mark.parametrize("exposure", [1e-6, 1e6])
 def test_exposure_is_of_no_account(exposure: float) -> None:
     rows = np.arange(200)
-    normal, sigma, body = matched(photographed(METAL), DIRECTION, INTENSITY, rows, CPU)
-    again, sigma_again, _ = matched(photographed(METAL, exposure), DIRECTION, exposure * INTENSITY, rows, CPU)
+    seen, exposed = photographed(METAL), photographed(METAL, exposure)
+    weights, of_exposed = (materials_under(*of, CPU) for of in ((seen, DIRECTION, INTENSITY), (exposed, DIRECTION, exposure * INTENSITY)))
+    normal, sigma, body = matched(seen, DIRECTION, INTENSITY, weights, rows, CPU)
+    again, sigma_again, _ = matched(exposed, DIRECTION, exposure * INTENSITY, of_exposed, rows, CPU)
     assert angles_deg(normal, again).max() < 0.1 and np.allclose(sigma, sigma_again, rtol=1e-2)
     assert np.isfinite(body).all() and (body >= 0).all()
 
@@ -106,7 +111,7 @@ def test_black_clipped_and_unlit_pixels_are_finite() -> None:
     samples[0], samples[1], samples[2, FEWEST - 1 :] = 0, 65535, 65535
     view = replace(view, samples=samples)
     by_lambert = normal_map(view, DIRECTION, INTENSITY, CPU)
-    found = with_exemplars(view, DIRECTION, INTENSITY, by_lambert, CPU, all_over=False)
+    found = with_exemplars(view, DIRECTION, INTENSITY, materials_under(view, DIRECTION, INTENSITY, CPU), by_lambert, CPU, all_over=False)
     for values in (found.normal, found.albedo, found.confidence):
         assert np.isfinite(values).all()
     assert (found.normal[:3] == by_lambert.normal[:3]).all() and (found.confidence[:3] == by_lambert.confidence[:3]).all()
@@ -118,7 +123,7 @@ def test_no_photograph_of_metal_is_left_out_for_not_being_lamberts() -> None:
     lights = Lights((DIRECTION,), (INTENSITY,), False)
     metal, chalk = (Capture("patches", (photographed(kind),)) for kind in (METAL, CHALK))
     assert without_misfits(metal, lights, CPU)[1]
-    begun = beginning(metal, lights, False, True, rough, CPU)
+    begun = beginning(metal, lights, False, True, rough, CPU, 0)
     assert begun.shiny and not begun.misfits and len(begun.used.views[0].lights) == LIGHTS
-    begun = beginning(chalk, lights, False, True, rough, CPU)
+    begun = beginning(chalk, lights, False, True, rough, CPU, 0)
     assert not begun.shiny and (begun.maps.normal == normal_map(chalk.views[0], DIRECTION, INTENSITY, CPU).normal).all()
