@@ -68,7 +68,8 @@ def test_lights_of_metal_and_of_half_metal(part: int) -> None:
     assert 0 < np.degrees(np.sqrt(variance)) < 5
 
 
-def test_lights_are_the_same_whatever_the_exposure_and_change_with_the_seed_alone() -> None:
+def test_lights_are_the_same_whatever_the_exposure_and_change_with_the_seed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvps.two_materials.TOGETHER", 30)
     view, outline = photographed(METAL), outer_band(photographed(METAL))
     found, variance = lights_by_materials(view, rough_lights(), BALL, outline, CPU, 0)
     again, same = lights_by_materials(view, rough_lights(), BALL, outline, CPU, 0)
@@ -79,7 +80,8 @@ def test_lights_are_the_same_whatever_the_exposure_and_change_with_the_seed_alon
     assert 0 < angles_deg(normalise(other), normalise(found)).max() < 10
 
 
-def test_without_an_outline_and_with_black_and_clipped_pixels_all_is_finite() -> None:
+def test_without_an_outline_and_with_black_and_clipped_pixels_all_is_finite(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvps.two_materials.TOGETHER", 30)
     view = photographed(METAL)
     samples = view.samples.copy()
     samples[:300], samples[300:600] = 0, 65535
