@@ -35,7 +35,7 @@ from mvps.correlation import sphere
 from mvps.exemplars import FEWEST, Weights, left_by_materials, patches
 from mvps.material import SHARPNESS
 from mvps.mesh import normalise
-from mvps.scene import Float, Int, View
+from mvps.scene import Bool, Float, Int, View
 from solvers.adam import Adam
 
 NORMALS = 1000
@@ -50,8 +50,11 @@ DRAWS = 4
 OUTLINE = 0.2
 """Radians by which normals near the outline are off, if they are what it tells."""
 
+AS_ROUGH = 0.15
+"""Radians along a tangent by which the silhouette's lights are off: 12 degrees in the mean (docs/findings/one_view.md)."""
+
 BODY = 20.0
-"""Weight of the second material's body at first, over all other weights: the two must differ to become different."""
+"""Weight of the second material's body at first, over its lobes' and all of the first's: the two must differ to become different."""
 
 ALONE, TOGETHER = 40, 300
 """Steps of the weights under the lights so far, and of everything: 600 leave as little."""
@@ -75,8 +78,11 @@ def lights_by_materials(view: View, lights: Float, rough: Float, outline: Int, d
     """(lights, 3) intensity times direction, camera frame, from rough ones (lights, 3), and the variance of a direction along a tangent,
     radians^2: mean of DRAWS, and how they scatter.
 
-    rough (pixels, 3): normals of the silhouette, camera frame, which pixels near the outline (n,) have but for OUTLINE.
+    rough (pixels, 3): normals of the silhouette, camera frame, which pixels near the outline (n,) have but for OUTLINE. Where no pixel has
+    values enough, lights stay.
     """
+    if not _enough(view).any():
+        return lights, AS_ROUGH**2
     draws = np.random.SeedSequence(seed).spawn(DRAWS)
     found = np.stack(on_cores(lambda draw: _lights(view, lights, rough, outline, device, np.random.default_rng(draw)), draws))
     strength = np.linalg.norm(found, axis=2, keepdims=True)
@@ -105,7 +111,10 @@ def _lights(view: View, lights: Float, rough: Float, outline: Int, device: torch
 
 
 def materials_under(view: View, direction: Float, intensity: Float, device: torch.device) -> Weights:
-    """Weights (2, 1 + lobes) of the object's materials under lights direction, intensity (lights, 3)."""
+    """Weights (2, 1 + lobes) of the object's materials under lights direction, intensity (lights, 3); all one where no pixel has values
+    enough."""
+    if not _enough(view).any():
+        return np.ones((2, 1 + len(SHARPNESS)), np.float32)
     nowhere = np.zeros((len(view.pixels), 3))
     asked = _asked(view, nowhere, np.zeros(0, int), device, np.random.default_rng(0))
     light = direction @ view.camera.rotation.T
@@ -115,10 +124,15 @@ def materials_under(view: View, direction: Float, intensity: Float, device: torc
     return found
 
 
+def _enough(view: View) -> Bool:
+    """(pixels,) whether a pixel has values enough to be asked."""
+    enough: Bool = view.usable().sum(1) >= FEWEST
+    return enough
+
+
 def _asked(view: View, rough: Float, outline: Int, device: torch.device, draw: np.random.Generator) -> _Asked:
     """Pixels to be asked, those near the outline (n,) last."""
-    usable = view.usable()
-    enough = usable.sum(1) >= FEWEST
+    usable, enough = view.usable(), _enough(view)
     anywhere = draw.permutation(np.flatnonzero(enough))[:PIXELS]
     rows = np.concatenate([anywhere, draw.permutation(outline[enough[outline]])[:AT_OUTLINE]])
     towards = normalise(-rays(view.camera, pixel_centres(view.pixels[rows]))[1].mean(0)[None]) @ view.camera.rotation.T

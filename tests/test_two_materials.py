@@ -89,6 +89,15 @@ def test_without_an_outline_and_with_black_and_clipped_pixels_all_is_finite(monk
     assert np.isfinite(found).all() and np.isfinite(variance)
 
 
+def test_of_four_lights_nothing_is_asked() -> None:
+    """They tell no normal, body and lobe."""
+    whole = photographed(METAL)
+    view = replace(whole, samples=whole.samples[:, :4], lights=whole.lights[:4])
+    found, variance = lights_by_materials(view, rough_lights()[:4], BALL, outer_band(view), CPU, 0)
+    assert (found == rough_lights()[:4]).all() and variance > 0
+    assert (materials_under(view, TRUE[:4] @ TURNED, np.ones((4, 3)), CPU) == 1).all()
+
+
 def test_materials_under_given_lights_tell_normals() -> None:
     """A fourth of the pixels is of chalk."""
     metal = np.arange(len(BALL)) % 4 > 0
