@@ -39,7 +39,7 @@ from mvps.cores import on_cores
 from mvps.correlation import sphere
 from mvps.material import POOR_FIT, SHARPNESS
 from mvps.mesh import normalise
-from mvps.scene import RELIABLE, Float, Int, NormalMap, View
+from mvps.scene import RELIABLE, Bool, Float, Int, NormalMap, View
 from mvps.shading import against, gain, half_dot_normal, half_length, lobe
 
 Weights = NDArray[np.float32]
@@ -48,8 +48,8 @@ Weights = NDArray[np.float32]
 Ask = Callable[[Tensor, Tensor, Tensor, list[Tensor]], Tensor]
 """Of values, whether they are usable, normals and their exemplars."""
 
-BY_EXEMPLARS = "normals by exemplars with lobes"
-"""How normals were found, for the account."""
+BY_EXEMPLARS, BY_MATERIALS = "normals by exemplars of two materials", "lights by two materials"
+"""How normals and lights were found, for the account."""
 
 NORMALS = 2000
 """Directions on the whole sphere, 4.5 degrees apart: with 6000 metals' normals err by 0.2 degrees less, for three times the time
@@ -81,7 +81,7 @@ PIXELS_AT_ONCE = 128
 
 def is_shiny(view: View, direction: Float, intensity: Float, device: torch.device) -> bool:
     """Whether lobes explain what a view of the object shows under lights direction, intensity (lights, 3)."""
-    known = np.flatnonzero(view.usable().sum(1) >= FEWEST)
+    known = np.flatnonzero(enough(view))
     some = np.sort(np.random.default_rng(0).permutation(known)[:ASKED])
     return bool(len(some)) and bool((_answers(view, direction, intensity, some, device, _gain) > GAINED).mean() > SHINY)
 
@@ -94,7 +94,7 @@ def with_exemplars(
     direction, intensity (lights, 3): of the view's photographs; weights (materials, 1 + lobes): of the object's materials; maps: by
     Lambert's law under these lights.
     """
-    rows = np.flatnonzero(view.usable().sum(1) >= FEWEST)
+    rows = np.flatnonzero(enough(view))
     if not all_over:
         rows = rows[misfit(view, direction, intensity, maps, rows) > POOR_FIT]
     normal, confidence, albedo = (of_pixels.copy() for of_pixels in (maps.normal, maps.confidence, maps.albedo))
@@ -102,6 +102,12 @@ def with_exemplars(
     normal[rows], confidence[rows] = found, 1 / (1 + (sigma / RELIABLE) ** 2)
     albedo[rows] *= (body / np.maximum(albedo[rows].mean(1), np.finfo(np.float32).tiny))[:, None]
     return replace(maps, normal=normal, confidence=confidence, albedo=albedo)
+
+
+def enough(view: View) -> Bool:
+    """(pixels,) whether a pixel has FEWEST values."""
+    found: Bool = view.usable().sum(1) >= FEWEST
+    return found
 
 
 def values(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:

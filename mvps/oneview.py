@@ -30,7 +30,10 @@ WORDS = (
     "One view: the surface is what its normals integrate to, open, of what this camera sees; its distance {distance} and heights of steps"
     " are not known from photographs under distant lights."
 )
-UNTOLD = " No body tells its lights, which are those under which two materials explain most: three to ten degrees off, or twenty."
+UNTOLD = (
+    " Lambert's law does not tell its lights, which are those under which two materials explain most of the photographs (where no pixel has"
+    " five values, what the silhouette tells): three to ten degrees off, or twenty."
+)
 OF_ORIGIN = "is the world origin's"
 FEWEST_LIGHTS = 12
 """From which on trimmed photographs leave enough for normals: nine."""
@@ -99,7 +102,7 @@ def first_lights(capture: Capture, rough: Float, under: Float, seed: int) -> tup
 def words_of(found: Resolved | None) -> str:
     """How the lights of one view were found."""
     if found is None:
-        return "one view, of which no body tells them: from the silhouette's normals at first"
+        return "one view, whose lights Lambert's law does not tell: from the silhouette's normals at first"
     return f"one view; three factors leave {100 * found.pseudo.residual:.1f} % of the images"
 
 
@@ -218,7 +221,7 @@ def refined_from(
     are found (solved), or given ones (not solved).
     """
     from mvps.device import chosen_device
-    from mvps.exemplars import BY_EXEMPLARS
+    from mvps.exemplars import BY_EXEMPLARS, BY_MATERIALS
     from mvps.jackknife import at_corners, either, shared_variance
     from mvps.joint.one_view import ROUNDS, Start, refine_view
     from mvps.joint.refine import RefineSettings
@@ -229,7 +232,8 @@ def refined_from(
     with progress.stage("photometric stereo") as stage:
         used, lights, maps, misfits, shiny, scatter = beginning(used, lights, found is not None, not solved, rough, device, settings.seed)
         start = Start(lights, maps, found)
-        stage.status("; ".join([f"{len(misfits)} photographs left out"] * bool(misfits) + [BY_EXEMPLARS] * shiny))
+        said = [f"{len(misfits)} photographs left out"] * bool(misfits) + [BY_MATERIALS] * (scatter > 0) + [BY_EXEMPLARS] * shiny
+        stage.status("; ".join(said))
     # Rounds bring lights by two materials no nearer.
     plan = parts.of(RefineSettings((), free_lights=found is not None, final=True))
     with progress.stage("joint refinement", total=rounds) as stage:

@@ -32,10 +32,10 @@ from torch.nn.functional import normalize
 from mvps.camera import pixel_centres, rays
 from mvps.cores import on_cores
 from mvps.correlation import sphere
-from mvps.exemplars import FEWEST, Weights, left_by_materials, patches
+from mvps.exemplars import Weights, enough, left_by_materials, patches
 from mvps.material import SHARPNESS
 from mvps.mesh import normalise
-from mvps.scene import Bool, Float, Int, View
+from mvps.scene import Float, Int, View
 from solvers.adam import Adam
 
 NORMALS = 1000
@@ -81,7 +81,7 @@ def lights_by_materials(view: View, lights: Float, rough: Float, outline: Int, d
     rough (pixels, 3): normals of the silhouette, camera frame, which pixels near the outline (n,) have but for OUTLINE. Where no pixel has
     values enough, lights stay.
     """
-    if not _enough(view).any():
+    if not enough(view).any():
         return lights, AS_ROUGH**2
     draws = np.random.SeedSequence(seed).spawn(DRAWS)
     found = np.stack(on_cores(lambda draw: _lights(view, lights, rough, outline, device, np.random.default_rng(draw)), draws))
@@ -113,7 +113,7 @@ def _lights(view: View, lights: Float, rough: Float, outline: Int, device: torch
 def materials_under(view: View, direction: Float, intensity: Float, device: torch.device) -> Weights:
     """Weights (2, 1 + lobes) of the object's materials under lights direction, intensity (lights, 3); all one where no pixel has values
     enough."""
-    if not _enough(view).any():
+    if not enough(view).any():
         return np.ones((2, 1 + len(SHARPNESS)), np.float32)
     nowhere = np.zeros((len(view.pixels), 3))
     asked = _asked(view, nowhere, np.zeros(0, int), device, np.random.default_rng(0))
@@ -124,17 +124,11 @@ def materials_under(view: View, direction: Float, intensity: Float, device: torc
     return found
 
 
-def _enough(view: View) -> Bool:
-    """(pixels,) whether a pixel has values enough to be asked."""
-    enough: Bool = view.usable().sum(1) >= FEWEST
-    return enough
-
-
 def _asked(view: View, rough: Float, outline: Int, device: torch.device, draw: np.random.Generator) -> _Asked:
     """Pixels to be asked, those near the outline (n,) last."""
-    usable, enough = view.usable(), _enough(view)
-    anywhere = draw.permutation(np.flatnonzero(enough))[:PIXELS]
-    rows = np.concatenate([anywhere, draw.permutation(outline[enough[outline]])[:AT_OUTLINE]])
+    usable, known = view.usable(), enough(view)
+    anywhere = draw.permutation(np.flatnonzero(known))[:PIXELS]
+    rows = np.concatenate([anywhere, draw.permutation(outline[known[outline]])[:AT_OUTLINE]])
     towards = normalise(-rays(view.camera, pixel_centres(view.pixels[rows]))[1].mean(0)[None]) @ view.camera.rotation.T
     grid = sphere(NORMALS)
     grid = grid[grid @ towards[0] > 0]
