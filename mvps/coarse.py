@@ -50,10 +50,10 @@ long as the residual falls."""
 def rough_shape(capture: Capture, progress: Progress) -> tuple[SignedDistanceGrid, Surface]:
     """The visual hull as a grid and as a surface."""
     from mvps.camera import surface_pixel
-    from mvps.hull import default_cells, hull_of_masks, signed_distance
+    from mvps.hull import hull_grid, hull_of_masks
 
     with progress.stage("visual hull") as stage:
-        grid = signed_distance(capture, default_cells(capture))
+        grid = hull_grid(capture)
         surface = hull_of_masks(capture, grid)
         pixel = surface_pixel(capture, surface)
         stage.status(f"{len(surface.vertices)} vertices, cells of {grid.spacing / pixel:.2g} pixels")

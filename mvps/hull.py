@@ -18,6 +18,7 @@ from skimage.measure import marching_cubes
 from mvps.camera import pixel_footprint, project
 from mvps.cores import on_cores
 from mvps.mesh import largest_pieces, piece_count
+from mvps.once import once_for
 from mvps.scene import Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
 from mvps.silhouette import beyond_mask, mask_distances
 
@@ -136,6 +137,13 @@ def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
     return _sample(masks, low, high, cells)
 
 
+@once_for
+def hull_grid(capture: Capture) -> SignedDistanceGrid:
+    """`signed_distance` with `default_cells`."""
+    return signed_distance(capture, default_cells(capture))
+
+
+@once_for
 def hull_of_masks(capture: Capture, grid: SignedDistanceGrid) -> Surface:
     """The hull with all pieces that masks ask for: the largest, and the next as long as it alone covers a share ALONE of the masks. What
     masks do not ask for are cells of noise, and ghosts where the cones of several parts meet."""

@@ -154,6 +154,12 @@ def piece_count(surface: Surface) -> int:
     return len(_pieces(surface)[1])
 
 
+def pieces_of(surface: Surface) -> list[Surface]:
+    """The connected components, from the largest area to the smallest."""
+    label, order = _pieces(surface)
+    return [without_unused_vertices(Surface(surface.vertices, surface.faces[label == k])) for k in order]
+
+
 def largest_pieces(surface: Surface, count: int = 1) -> Surface:
     """The `count` connected components with the largest areas."""
     label, order = _pieces(surface)

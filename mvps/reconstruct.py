@@ -119,6 +119,7 @@ def reconstruct(
     from mvps.passes import stage_two
     from mvps.plan import Parts, last_pass
     from mvps.pyramid import halvings
+    from mvps.thin import with_thin_parts, without_thin_parts
 
     blas_as_asked()
     parts = parts or Parts()
@@ -130,28 +131,30 @@ def reconstruct(
     length = own_length([view.camera for view in used.views])
     capture, used = in_lengths(capture, length), in_lengths(used, length)
     held = held and in_lengths(held, length)
+    rest = without_thin_parts(used, progress)
 
     def step(name: str, make: Callable[[], Any]) -> Any:
         return make() if checkpoints is None else checkpoints.step(name, make, progress)
 
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":
-        refined = drafted(used, settings, lights, parts, progress, step)
+        refined = drafted(rest, settings, lights, parts, progress, step)
     else:
-        start, rounds = coarse(used, settings, lights, parts, progress, step)
+        start, rounds = coarse(rest, settings, lights, parts, progress, step)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        free, less = lights is None and start.rounds[-1]["residual"] <= POOR_FIT, eased(settings.preset, used, start.rounds)
-        far = few_lights(used) or halvings(used) > 0
-        start = replace(start, maps=()) if halvings(used) else start
+        free, less = lights is None and start.rounds[-1]["residual"] <= POOR_FIT, eased(settings.preset, rest, start.rounds)
+        far = few_lights(rest) or halvings(rest) > 0
+        start = replace(start, maps=()) if halvings(rest) else start
         plan, name = parts.of(last_pass(settings.preset, free, far, rounds, less)), "joint refinement"
-        refined = step(name, lambda: stage_two(name, used, start.surface, start, plan, settings, progress, start.carried))
+        refined = step(name, lambda: stage_two(name, rest, start.surface, start, plan, settings, progress, start.carried))
         if lights is None and not free and start.status != "converged":
             # Lights that stay where they still turned have not settled.
             refined = replace(refined, status=start.status, text=start.text)
+    refined, lacking = with_thin_parts(refined, rest, used)
     with progress.stage("lights and normals of all views"):
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, chosen_device(settings.device))
         pictures = normal_pictures(capture, used, refined)
-    result = told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, findings)
+    result = told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, [*findings, *lacking])
     return in_world_units(result, length)
 
 

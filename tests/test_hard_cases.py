@@ -219,13 +219,13 @@ def test_materials(scene: Scene) -> None:
     assert black.albedo.mean() == pytest.approx(0.02) and np.array_equal(black.specular_weight, scene.material.specular_weight)
 
 
-@pytest.mark.parametrize("name", ["sphere", "slab", "bowl", "touching", "rods"])
+@pytest.mark.parametrize("name", ["sphere", "slab", "bowl", "touching", "rods", "rings"])
 def test_shapes_are_closed_and_fill_the_unit_ball(name: str) -> None:
-    surface = scenes.rods(2.0) if name == "rods" else getattr(scenes, name)()
+    surface = getattr(scenes, name)(2.0) if name in ("rods", "rings") else getattr(scenes, name)()
     body = trimesh.Trimesh(surface.vertices, surface.faces)
     assert np.linalg.norm(surface.vertices, axis=1).max() == pytest.approx(1, abs=1e-9)
     assert body.is_watertight and body.volume > 0
-    assert body.body_count == {"touching": 2, "rods": 9}.get(name, 1)
+    assert body.body_count == {"touching": 2, "rods": 9, "rings": 4}.get(name, 1)
 
 
 def test_a_bowl_is_hollow_and_rods_are_thin() -> None:

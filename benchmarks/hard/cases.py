@@ -149,8 +149,9 @@ def _cameras() -> Iterator[tuple[str, Callable[[], Sample]]]:
 
 
 def _shapes() -> Iterator[tuple[str, Callable[[], Sample]]]:
-    for px in (0.5, 1, 2):
+    for px in (0.5, 1, 2, 3):
         yield f"shape-rods-{_number(px)}-px", partial(of_shape, partial(scenes.rods, px))
+    yield "shape-rings-2-px", partial(of_shape, partial(scenes.rings, 2.0))
     for name in ("bowl", "touching", "chain", "slab", "sphere"):
         yield f"shape-{name}", partial(of_shape, getattr(scenes, name))
     yield "shape-bowl-lit-within", partial(of_shape, scenes.bowl, scenes.lit_between)

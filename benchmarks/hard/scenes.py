@@ -241,6 +241,19 @@ def rods(width: float, size: int = BASE.size) -> Surface:
     return surface_of(*parts)
 
 
+def rings(width: float, size: int = BASE.size) -> Surface:
+    """A ball with three upright rings, this many pixels of an image of `size` pixels thick and 0.6 of the object's radius across."""
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.5)
+    parts = [ball]
+    for k in range(3):
+        ring = trimesh.creation.torus(0.3, width / (0.9 * size), major_sections=64, minor_sections=16)
+        ring.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
+        ring.apply_translation((0.6, 0, 0))
+        ring.apply_transform(trimesh.transformations.rotation_matrix(2 * np.pi * k / 3, (0, 0, 1)))
+        parts.append(ring)
+    return surface_of(*parts)
+
+
 # ------------------------------------------------------------------------------------------------ cameras
 
 

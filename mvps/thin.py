@@ -1,0 +1,286 @@
+"""Thin parts, which no grid and no mesh of two pixels' cells holds, from the masks alone.
+
+A rod of two pixels passes between the nodes of the hull's grid, and one of three is shorter around than edges of meshes are long, and
+crumbles on the way. Masks show both all the same. With S_i the pixels of view i that a surface covers, and b_i those of its mask that lie
+farther from S_i than outlines err,
+
+    T = points in all masks that show in b_i of two views or more
+
+is what the surface lacks. T is found on a grid as fine as masks are, from distances that are not smoothed, in which a rod of a pixel would
+vanish. Where the cones of several rods meet, T has ghosts as well, which explain no pixel that rods do not: of its pieces those stay that
+cover most of what is bare, each those that others left. They are joined with the surface (Boolean operations in exact arithmetic: Zhou et
+al. 2016).
+
+Rods that the hull lacks are taken out of the masks beforehand, for half a rod is worse than none: a mesh is torn where it ends. Sheets
+stay, whose sides photographs tell. What the result lacks is found at the end. Colours of thin parts are photographed, and textures have
+them. Of their normals photographs say nothing that is not mixed with what is beside them: they are the surface's own, and no confidence is
+in them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import cv2
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, distance_transform_edt, label
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from mvps.camera import project
+from mvps.cores import neighbours, on_cores
+from mvps.finding import Finding
+from mvps.hull import hull_grid, hull_of_masks
+from mvps.mesh import pieces_of, vertex_normals
+from mvps.progress import Progress
+from mvps.pyramid import halvings
+from mvps.scene import Bool, Capture, Float, Int, NormalMap, SignedDistanceGrid, Surface, View
+from mvps.silhouette import beyond_mask
+from mvps.visibility import camera_hits, ray_caster
+
+if TYPE_CHECKING:
+    from mvps.joint.refine import Refined
+
+BEYOND = 2.0
+"""Pixels from what a surface covers, from which pixels of a mask are bare: less is an error of its outline, whose cells are two pixels."""
+
+FINER = 4
+"""Cells of the fine grid to one of the hull's: half a pixel each."""
+
+SLACK = 0.15
+"""Pixels by which T may lie outside of a mask: half of what its border errs by. Between pixels that touch at corners alone, as those of a
+slanting line do, is 0."""
+
+EVIDENCE = 4
+"""Bare pixels in each of two views that a piece has to itself."""
+
+ROOT = 1.5
+"""Pixels that pieces reach beyond what is bare, towards the rest: the last one before it is bare in no view, and half of one for the
+grid."""
+
+SHRINK, GROW, STEPS = 0.5, 0.525, 30
+"""Of Taubin's smoothing, in turn: waves of two pixels, four edges, are gone after so many, of those of four 0.8 are left."""
+
+AROUND = np.ones((3, 3, 3), bool)
+
+
+class _Bare(NamedTuple):
+    """Of a view: bare (height, width), b_i; near (height, width), b_i with half as much distance, and the pixels beside it; distance
+    (height, width) to the mask's boundary, pixels, negative inside."""
+
+    view: View
+    bare: Bool
+    near: Bool
+    distance: NDArray[np.float32]
+
+
+def without_thin_parts(capture: Capture, progress: Progress) -> Capture:
+    """The capture without pixels of rods that the hull's grid does not hold; itself where there are none."""
+    if not _may_have_thin(capture):
+        return capture
+    with progress.stage("thin parts") as stage:
+        views, pieces = _found(capture, hull_of_masks(capture, hull_grid(capture)))
+        stage.status(f"{len(pieces)} that the hull does not hold")
+        return _without(capture, views, pieces)
+
+
+def with_thin_parts(refined: Refined, rest: Capture, capture: Capture) -> tuple[Refined, list[Finding]]:
+    """What Stage II made of the rest of a capture, with what it lacks of the masks, and what to say of that. The reflectance of thin parts
+    is the nearest vertex's; of their pixels nothing is known."""
+    if not _may_have_thin(capture):
+        return refined, []
+    maps = tuple(_widened(*one) for one in zip(refined.maps, rest.views, capture.views, strict=True))
+    pieces = _found(capture, refined.surface)[1]
+    if not pieces:
+        return replace(refined, maps=maps), []
+    surface = joined(refined.surface, pieces)
+    said = f"{f'{len(pieces)} parts are' if len(pieces) > 1 else 'a part is'} thinner than meshes hold"
+    if surface is None:
+        return replace(refined, maps=maps), [Finding("mask", "all views", f"{said}, and missing: the mesh is not closed", False)]
+    told = Finding("mask", "all views", f"{said}: their shape is what masks leave of it, without normals of their own", True)
+    return replace(_carried_over(refined, surface), maps=maps), [told]
+
+
+def joined(surface: Surface, pieces: Sequence[Surface]) -> Surface | None:
+    """The union of a closed surface and closed pieces; None where the surface is not closed."""
+    from igl.copyleft.cgal import mesh_boolean
+
+    vertices, faces = surface.vertices, surface.faces.astype(np.int64)
+    for piece in pieces:
+        try:
+            vertices, faces, *_ = mesh_boolean(vertices, faces, piece.vertices, piece.faces, "union")
+        except RuntimeError:
+            return None
+    return Surface(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
+
+
+def _carried_over(refined: Refined, surface: Surface) -> Refined:
+    """The same on a surface of which some vertices are new."""
+    from mvps.joint.detail import Detailed, interpolated
+
+    distance, same = neighbours(cKDTree(refined.surface.vertices), surface.vertices)
+    n, there = len(surface.vertices), distance == 0
+    share = sp.csr_matrix((np.ones(n), same, np.arange(n + 1)), (n, len(refined.surface.vertices)))
+    material = interpolated(refined.material, Detailed(surface, share))
+    normal = np.where(there[:, None], material.normal, vertex_normals(surface))
+    material = replace(material, normal=normal, confidence=np.where(there, material.confidence, 0))
+    return replace(refined, surface=surface, material=material, unexplained=np.where(there, refined.unexplained[same], np.nan))
+
+
+def _widened(maps: NormalMap, rest: View, whole: View) -> NormalMap:
+    """A view's normal map at all its pixels, with no confidence where the rest has none."""
+    there = rest.mask[whole.mask]
+    normal = np.tile(-whole.camera.rotation[2].astype(maps.normal.dtype), (len(there), 1))
+    albedo, confidence = np.zeros((len(there), 3), maps.albedo.dtype), np.zeros(len(there), maps.confidence.dtype)
+    normal[there], albedo[there], confidence[there] = maps.normal, maps.albedo, maps.confidence
+    return NormalMap(normal, albedo, confidence)
+
+
+def _wide(view: View, radius: int) -> Bool:
+    """(height, width) what of a mask discs of this radius, pixels, fit into."""
+    x, y = np.indices((2 * radius + 1,) * 2) - radius
+    disc = (x**2 + y**2 <= radius**2).astype(np.uint8)
+    wide: Bool = cv2.morphologyEx(view.mask.astype(np.uint8), cv2.MORPH_OPEN, disc) > 0
+    return wide
+
+
+def _thinnest(capture: Capture) -> int:
+    """Radius, pixels, of what grids and meshes hold of a capture: of pixels of the size at which its shape is looked for, BEYOND."""
+    radius: int = int(BEYOND) * 2 ** halvings(capture)
+    return radius
+
+
+def _may_have_thin(capture: Capture) -> bool:
+    """Whether masks of two views have parts that reach beyond what is wide by as much as that."""
+    radius = _thinnest(capture)
+
+    def one(view: View) -> bool:
+        wide = _wide(view, radius)
+        return bool(wide.any() and (view.mask & (distance_transform_edt(~wide) > radius)).any())
+
+    return sum(on_cores(one, capture.views)) >= 2
+
+
+def _bare(capture: Capture, surface: Surface) -> list[_Bare]:
+    caster = ray_caster(surface)
+
+    def one(view: View) -> _Bare:
+        covered = np.zeros(view.mask.shape, bool)
+        covered[view.mask] = camera_hits(caster, view.camera, view.pixels).face >= 0
+        away = np.where(view.mask, distance_transform_edt(~covered), 0)
+        inside, outside = distance_transform_edt(view.mask), distance_transform_edt(~view.mask)
+        distance = np.where(view.mask, 0.5 - inside, outside - 0.5).astype(np.float32)
+        return _Bare(view, away > BEYOND, binary_dilation(away > BEYOND / 2, AROUND[0]), distance)
+
+    return on_cores(one, capture.views)
+
+
+def _without(capture: Capture, views: Sequence[_Bare], pieces: Sequence[Surface]) -> Capture:
+    """The capture without the bare pixels of pieces that most of theirs are thin in."""
+    radius = _thinnest(capture)
+    thin = on_cores(lambda of: of.bare & ~_wide(of.view, radius), views)
+    gone = [np.zeros_like(of) for of in thin]
+    for piece in pieces:
+        shown = [_shown(piece, of) for of in views]
+        if 2 * sum(int((one & of).sum()) for one, of in zip(shown, thin, strict=True)) > sum(int(one.sum()) for one in shown):
+            gone = [so_far | (one & of) for so_far, one, of in zip(gone, shown, thin, strict=True)]
+    if not any(of.any() for of in gone):
+        return capture
+    kept = [(of.view, ~lost) for of, lost in zip(views, gone, strict=True)]
+    return Capture(capture.name, tuple(replace(v, mask=v.mask & stays, samples=v.samples[stays[v.mask]]) for v, stays in kept))
+
+
+def _shown(piece: Surface, of: _Bare) -> Bool:
+    """(height, width) bare pixels of a view that a piece covers."""
+    pixels, found = np.argwhere(of.bare), np.zeros_like(of.bare)
+    found[tuple(pixels[camera_hits(ray_caster(piece), of.view.camera, pixels).face >= 0].T)] = True
+    return found
+
+
+def _found(capture: Capture, surface: Surface) -> tuple[list[_Bare], list[Surface]]:
+    """What of the masks a surface lacks, and the pieces of T that explain it."""
+    hull, views = hull_grid(capture), _bare(capture, surface)
+    return views, _needed(views, [piece for nodes in _where(views, hull) for piece in _pieces(views, hull, nodes)])
+
+
+def _outside(views: Sequence[_Bare], points: Float) -> tuple[Float, Int, Int]:
+    """How far points (n, 3) lie outside of the masks, less SLACK, world units, negative inside; in how many views they show in bare pixels,
+    and near them."""
+
+    def one(of: _Bare) -> tuple[Float, Bool, Bool]:
+        image, depth = project(of.view.camera, points)
+        distance = (beyond_mask(of.view.camera, of.distance, image) - SLACK) * depth / of.view.camera.focal_length
+        seen = depth > 0
+        return np.where(seen, distance, np.inf), seen & _at(of.bare, image), seen & _at(of.near, image)
+
+    outside, bare, near = zip(*on_cores(one, views), strict=True)
+    return np.max(outside, 0), np.sum(bare, 0), np.sum(near, 0)
+
+
+def _at(picture: Bool, image: Float) -> Bool:
+    """(n,) what a picture (height, width) has at image coordinates (n, 2), False beside it."""
+    column, row = np.floor(image).astype(int).T
+    there = (row >= 0) & (row < picture.shape[0]) & (column >= 0) & (column < picture.shape[1])
+    found = np.zeros(len(image), bool)
+    found[there] = picture[row[there], column[there]]
+    return found
+
+
+def _where(views: Sequence[_Bare], hull: SignedDistanceGrid) -> list[Bool]:
+    """Parts of the hull's grid, as nodes (x, y, z), around which T may lie."""
+    if sum(int(of.bare.sum()) >= EVIDENCE for of in views) < 2:
+        return []
+    nodes = np.argwhere(hull.values < hull.spacing)
+    outside, bare, near = _outside(views, hull.origin + hull.spacing * nodes)
+    may, shown = np.zeros((2, *hull.values.shape), bool)
+    may[tuple(nodes[(near >= 2) & (outside < hull.spacing)].T)] = True
+    shown[tuple(nodes[bare >= 2].T)] = True
+    numbers, _ = label(may, AROUND)
+    return [binary_dilation(numbers == k, AROUND) for k in np.unique(numbers[shown & may])]
+
+
+def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> list[Surface]:
+    """Connected parts of T, and of what masks hold for ROOT around, about some nodes (x, y, z) of the hull's grid."""
+    where = np.argwhere(nodes)
+    low, high = where.min(0), where.max(0) + 1
+    cells = np.pad(nodes[tuple(map(slice, low, high))], 1)
+    spacing, fine = hull.spacing / FINER, np.argwhere(cells.repeat(FINER, 0).repeat(FINER, 1).repeat(FINER, 2))
+    # A node of the coarse grid stands in the middle of FINER^3 of the fine one.
+    origin = hull.origin + hull.spacing * (low - 1.5) + spacing / 2
+    outside, _, near = _outside(views, origin + spacing * fine)
+    inside = np.zeros(np.array(cells.shape) * FINER, bool)
+    inside[tuple(fine[(outside < 0) & (near >= 2)].T)] = True
+    if not inside.any():
+        return []
+    reached = binary_dilation(inside, AROUND, iterations=round(ROOT * FINER / 2))[tuple(fine.T)]
+    values = np.full(inside.shape, spacing)
+    values[tuple(fine.T)] = np.where(reached, np.minimum(outside, spacing), spacing)
+    vertices, faces, _, _ = marching_cubes(values, 0.0)
+    return pieces_of(_smooth(Surface(origin + spacing * vertices.astype(np.float64), faces.astype(np.int64))))
+
+
+def _smooth(surface: Surface) -> Surface:
+    """Without the masks' staircases, but no thinner (Taubin 1995)."""
+    import trimesh
+
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    trimesh.smoothing.filter_taubin(mesh, SHRINK, GROW, STEPS)
+    return Surface(np.array(mesh.vertices), surface.faces)
+
+
+def _needed(views: Sequence[_Bare], pieces: Sequence[Surface]) -> list[Surface]:
+    """Pieces that cover bare pixels which those before them do not, the one that covers most of them first."""
+    shown, kept = [[_shown(piece, of) for of in views] for piece in pieces], list[Surface]()
+    left = [of.bare for of in views]
+    while len(kept) < len(pieces):
+        gains = [sorted(int((one & free).sum()) for one, free in zip(of, left, strict=True)) for of in shown]
+        best = int(np.argmax([sum(gain) for gain in gains]))
+        if gains[best][-2] < EVIDENCE:
+            break
+        kept.append(pieces[best])
+        left = [free & ~one for one, free in zip(shown[best], left, strict=True)]
+    return kept
