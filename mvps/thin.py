@@ -8,18 +8,17 @@ farther from S_i than outlines err,
 
 is what the surface lacks. T is found on a grid as fine as masks are, from distances that are not smoothed, in which a rod of a pixel would
 vanish. Where the cones of several rods meet, T has ghosts as well, which explain no pixel that rods do not: of its pieces those stay that
-cover most of what is bare, each those that others left. They are joined with the surface (Boolean operations in exact arithmetic: Zhou et
-al. 2016).
+cover most of what is bare, each those that others left, if it is thin in the masks: of the wide side of a sheet photographs tell, and masks
+of few views leave more of it than there is. They are joined with the surface (Boolean operations in exact arithmetic: Zhou et al. 2016).
 
-Rods that the hull lacks are taken out of the masks beforehand, for half a rod is worse than none: a mesh is torn where it ends. Sheets
-stay, whose sides photographs tell. What the result lacks is found at the end. Colours of thin parts are photographed, and textures have
-them. Of their normals photographs say nothing that is not mixed with what is beside them: they are the surface's own, and no confidence is
-in them.
+What the hull lacks is taken out of the masks beforehand, for half a rod is worse than none: a mesh is torn where it ends. What
+the result lacks is found at the end. Colours of thin parts are photographed, and textures have them. Of their normals photographs say
+nothing that is not mixed with what is beside them: they are the surface's own, and no confidence is in them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -36,6 +35,7 @@ from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.hull import hull_grid, hull_of_masks
 from mvps.mesh import pieces_of, vertex_normals
+from mvps.once import once_for
 from mvps.progress import Progress
 from mvps.pyramid import halvings
 from mvps.scene import Bool, Capture, Float, Int, NormalMap, SignedDistanceGrid, Surface, View
@@ -50,6 +50,9 @@ BEYOND = 2.0
 
 FINER = 4
 """Cells of the fine grid to one of the hull's: half a pixel each."""
+
+MOST_NODES = 1 << 25
+"""Of a fine grid, 0.2 GB; half as fine where a piece's would have more."""
 
 SLACK = 0.15
 """Pixels by which T may lie outside of a mask: half of what its border errs by. Between pixels that touch at corners alone, as those of a
@@ -69,11 +72,12 @@ AROUND = np.ones((3, 3, 3), bool)
 
 
 class _Bare(NamedTuple):
-    """Of a view: bare (height, width), b_i; near (height, width), b_i with half as much distance, and the pixels beside it; distance
-    (height, width) to the mask's boundary, pixels, negative inside."""
+    """Of a view: bare (height, width), b_i; thin (height, width), what of it no disc fits into; near (height, width), b_i with half as much
+    distance, and the pixels beside it; distance (height, width) to the mask's boundary, pixels, negative inside."""
 
     view: View
     bare: Bool
+    thin: Bool
     near: Bool
     distance: NDArray[np.float32]
 
@@ -85,7 +89,7 @@ def without_thin_parts(capture: Capture, progress: Progress) -> Capture:
     with progress.stage("thin parts") as stage:
         views, pieces = _found(capture, hull_of_masks(capture, hull_grid(capture)))
         stage.status(f"{len(pieces)} that the hull does not hold")
-        return _without(capture, views, pieces)
+        return Capture(capture.name, tuple(on_cores(lambda of: _without(of, pieces), views))) if pieces else capture
 
 
 def with_thin_parts(refined: Refined, rest: Capture, capture: Capture) -> tuple[Refined, list[Finding]]:
@@ -93,16 +97,17 @@ def with_thin_parts(refined: Refined, rest: Capture, capture: Capture) -> tuple[
     is the nearest vertex's; of their pixels nothing is known."""
     if not _may_have_thin(capture):
         return refined, []
-    maps = tuple(_widened(*one) for one in zip(refined.maps, rest.views, capture.views, strict=True))
+    if rest is not capture:
+        refined = replace(refined, maps=tuple(map(_widened, refined.maps, rest.views, capture.views)))
     pieces = _found(capture, refined.surface)[1]
     if not pieces:
-        return replace(refined, maps=maps), []
-    surface = joined(refined.surface, pieces)
+        return refined, []
     said = f"{f'{len(pieces)} parts are' if len(pieces) > 1 else 'a part is'} thinner than meshes hold"
+    surface = joined(refined.surface, pieces)
     if surface is None:
-        return replace(refined, maps=maps), [Finding("mask", "all views", f"{said}, and missing: the mesh is not closed", False)]
-    told = Finding("mask", "all views", f"{said}: their shape is what masks leave of it, without normals of their own", True)
-    return replace(_carried_over(refined, surface), maps=maps), [told]
+        return refined, [Finding("mask", "all views", f"{said}, and missing: the mesh is not closed", False)]
+    told = Finding("mask", "all views", f"{said}: the shape is what masks leave of it, without normals of its own", True)
+    return _carried_over(refined, surface), [told]
 
 
 def joined(surface: Surface, pieces: Sequence[Surface]) -> Surface | None:
@@ -154,6 +159,7 @@ def _thinnest(capture: Capture) -> int:
     return radius
 
 
+@once_for
 def _may_have_thin(capture: Capture) -> bool:
     """Whether masks of two views have parts that reach beyond what is wide by as much as that."""
     radius = _thinnest(capture)
@@ -166,7 +172,7 @@ def _may_have_thin(capture: Capture) -> bool:
 
 
 def _bare(capture: Capture, surface: Surface) -> list[_Bare]:
-    caster = ray_caster(surface)
+    caster, radius = ray_caster(surface), _thinnest(capture)
 
     def one(view: View) -> _Bare:
         covered = np.zeros(view.mask.shape, bool)
@@ -174,24 +180,23 @@ def _bare(capture: Capture, surface: Surface) -> list[_Bare]:
         away = np.where(view.mask, distance_transform_edt(~covered), 0)
         inside, outside = distance_transform_edt(view.mask), distance_transform_edt(~view.mask)
         distance = np.where(view.mask, 0.5 - inside, outside - 0.5).astype(np.float32)
-        return _Bare(view, away > BEYOND, binary_dilation(away > BEYOND / 2, AROUND[0]), distance)
+        bare = away > BEYOND
+        return _Bare(view, bare, bare & ~_wide(view, radius), binary_dilation(away > BEYOND / 2, AROUND[0]), distance)
 
     return on_cores(one, capture.views)
 
 
-def _without(capture: Capture, views: Sequence[_Bare], pieces: Sequence[Surface]) -> Capture:
-    """The capture without the bare pixels of pieces that most of theirs are thin in."""
-    radius = _thinnest(capture)
-    thin = on_cores(lambda of: of.bare & ~_wide(of.view, radius), views)
-    gone = [np.zeros_like(of) for of in thin]
-    for piece in pieces:
-        shown = [_shown(piece, of) for of in views]
-        if 2 * sum(int((one & of).sum()) for one, of in zip(shown, thin, strict=True)) > sum(int(one.sum()) for one in shown):
-            gone = [so_far | (one & of) for so_far, one, of in zip(gone, shown, thin, strict=True)]
-    if not any(of.any() for of in gone):
-        return capture
-    kept = [(of.view, ~lost) for of, lost in zip(views, gone, strict=True)]
-    return Capture(capture.name, tuple(replace(v, mask=v.mask & stays, samples=v.samples[stays[v.mask]]) for v, stays in kept))
+def _without(of: _Bare, pieces: Sequence[Surface]) -> View:
+    """The view without the pixels of pieces that are thin in it."""
+    view, shown = of.view, np.any([_shown(piece, of) for piece in pieces], axis=0)
+    stays = ~(shown & of.thin)
+    return replace(view, mask=view.mask & stays, samples=view.samples[stays[view.mask]])
+
+
+def _slender(piece: Surface, views: Sequence[_Bare]) -> bool:
+    """Whether most of the bare pixels that a piece covers are of thin parts of the masks."""
+    shown = [_shown(piece, of) for of in views]
+    return 2 * sum(int((one & of.thin).sum()) for one, of in zip(shown, views, strict=True)) > sum(int(one.sum()) for one in shown)
 
 
 def _shown(piece: Surface, of: _Bare) -> Bool:
@@ -204,7 +209,8 @@ def _shown(piece: Surface, of: _Bare) -> Bool:
 def _found(capture: Capture, surface: Surface) -> tuple[list[_Bare], list[Surface]]:
     """What of the masks a surface lacks, and the pieces of T that explain it."""
     hull, views = hull_grid(capture), _bare(capture, surface)
-    return views, _needed(views, [piece for nodes in _where(views, hull) for piece in _pieces(views, hull, nodes)])
+    pieces = [piece for nodes in _where(views, hull) for piece in _pieces(views, hull, nodes)]
+    return views, [piece for piece in _needed(views, pieces) if _slender(piece, views)]
 
 
 def _outside(views: Sequence[_Bare], points: Float) -> tuple[Float, Int, Int]:
@@ -230,17 +236,18 @@ def _at(picture: Bool, image: Float) -> Bool:
     return found
 
 
-def _where(views: Sequence[_Bare], hull: SignedDistanceGrid) -> list[Bool]:
+def _where(views: Sequence[_Bare], hull: SignedDistanceGrid) -> Iterator[Bool]:
     """Parts of the hull's grid, as nodes (x, y, z), around which T may lie."""
     if sum(int(of.bare.sum()) >= EVIDENCE for of in views) < 2:
-        return []
+        return
     nodes = np.argwhere(hull.values < hull.spacing)
     outside, bare, near = _outside(views, hull.origin + hull.spacing * nodes)
     may, shown = np.zeros((2, *hull.values.shape), bool)
     may[tuple(nodes[(near >= 2) & (outside < hull.spacing)].T)] = True
     shown[tuple(nodes[bare >= 2].T)] = True
     numbers, _ = label(may, AROUND)
-    return [binary_dilation(numbers == k, AROUND) for k in np.unique(numbers[shown & may])]
+    for k in np.unique(numbers[shown & may]):
+        yield binary_dilation(numbers == k, AROUND)
 
 
 def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> list[Surface]:
@@ -248,16 +255,17 @@ def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> li
     where = np.argwhere(nodes)
     low, high = where.min(0), where.max(0) + 1
     cells = np.pad(nodes[tuple(map(slice, low, high))], 1)
-    spacing, fine = hull.spacing / FINER, np.argwhere(cells.repeat(FINER, 0).repeat(FINER, 1).repeat(FINER, 2))
-    # A node of the coarse grid stands in the middle of FINER^3 of the fine one.
+    finer = FINER if cells.size * FINER**3 <= MOST_NODES else FINER // 2
+    spacing, fine = hull.spacing / finer, np.argwhere(cells.repeat(finer, 0).repeat(finer, 1).repeat(finer, 2))
+    # A node of the coarse grid stands in the middle of finer^3 of the fine one.
     origin = hull.origin + hull.spacing * (low - 1.5) + spacing / 2
     outside, _, near = _outside(views, origin + spacing * fine)
-    inside = np.zeros(np.array(cells.shape) * FINER, bool)
+    inside = np.zeros(np.array(cells.shape) * finer, bool)
     inside[tuple(fine[(outside < 0) & (near >= 2)].T)] = True
     if not inside.any():
         return []
-    reached = binary_dilation(inside, AROUND, iterations=round(ROOT * FINER / 2))[tuple(fine.T)]
-    values = np.full(inside.shape, spacing)
+    reached = binary_dilation(inside, AROUND, iterations=round(ROOT * finer / 2))[tuple(fine.T)]
+    values = np.full(inside.shape, spacing, np.float32)
     values[tuple(fine.T)] = np.where(reached, np.minimum(outside, spacing), spacing)
     vertices, faces, _, _ = marching_cubes(values, 0.0)
     return pieces_of(_smooth(Surface(origin + spacing * vertices.astype(np.float64), faces.astype(np.int64))))
