@@ -34,7 +34,7 @@ from mvps.camera import project
 from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.hull import hull_grid, hull_of_masks
-from mvps.mesh import pieces_of, vertex_normals
+from mvps.mesh import decimated, pieces_of, vertex_normals
 from mvps.once import once_for
 from mvps.progress import Progress
 from mvps.pyramid import halvings
@@ -68,18 +68,29 @@ grid."""
 SHRINK, GROW, STEPS = 0.5, 0.525, 30
 """Of Taubin's smoothing, in turn: waves of two pixels, four edges, are gone after so many, of those of four 0.8 are left."""
 
+KEPT = 4
+"""One of so many faces of pieces stays: smoothed, edges of half a pixel tell no more than those of one."""
+
 AROUND = np.ones((3, 3, 3), bool)
 
 
 class _Bare(NamedTuple):
-    """Of a view: bare (height, width), b_i; thin (height, width), what of it no disc fits into; near (height, width), b_i with half as much
-    distance, and the pixels beside it; distance (height, width) to the mask's boundary, pixels, negative inside."""
+    """Of a view: pixels (n, 2), rows and columns of b_i; thin (n,), whether no disc fits into the mask there; pictures (height, width):
+    bare, b_i; near, b_i with half as much distance, and the pixels beside it; distance to the mask's boundary, pixels, negative inside."""
 
     view: View
-    bare: Bool
+    pixels: Int
     thin: Bool
+    bare: Bool
     near: Bool
     distance: NDArray[np.float32]
+
+
+class _Piece(NamedTuple):
+    """A part of T, closed, and which of the views' bare pixels it covers, (n,) of each."""
+
+    surface: Surface
+    covers: list[Bool]
 
 
 def without_thin_parts(capture: Capture, progress: Progress) -> Capture:
@@ -89,7 +100,7 @@ def without_thin_parts(capture: Capture, progress: Progress) -> Capture:
     with progress.stage("thin parts") as stage:
         views, pieces = _found(capture, hull_of_masks(capture, hull_grid(capture)))
         stage.status(f"{len(pieces)} that the hull does not hold")
-        return Capture(capture.name, tuple(on_cores(lambda of: _without(of, pieces), views))) if pieces else capture
+        return Capture(capture.name, tuple(_without(*one) for one in zip(views, _covered(pieces), strict=True))) if pieces else capture
 
 
 def with_thin_parts(refined: Refined, rest: Capture, capture: Capture) -> tuple[Refined, list[Finding]]:
@@ -103,7 +114,7 @@ def with_thin_parts(refined: Refined, rest: Capture, capture: Capture) -> tuple[
     if not pieces:
         return refined, []
     said = f"{f'{len(pieces)} parts are' if len(pieces) > 1 else 'a part is'} thinner than meshes hold"
-    surface = joined(refined.surface, pieces)
+    surface = joined(refined.surface, [piece.surface for piece in pieces])
     if surface is None:
         return refined, [Finding("mask", "all views", f"{said}, and missing: the mesh is not closed", False)]
     told = Finding("mask", "all views", f"{said}: the shape is what masks leave of it, without normals of its own", True)
@@ -114,12 +125,13 @@ def joined(surface: Surface, pieces: Sequence[Surface]) -> Surface | None:
     """The union of a closed surface and closed pieces; None where the surface is not closed."""
     from igl.copyleft.cgal import mesh_boolean
 
-    vertices, faces = surface.vertices, surface.faces.astype(np.int64)
-    for piece in pieces:
-        try:
-            vertices, faces, *_ = mesh_boolean(vertices, faces, piece.vertices, piece.faces, "union")
-        except RuntimeError:
-            return None
+    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces)])
+    vertices = np.concatenate([piece.vertices for piece in pieces])
+    faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts[:-1], strict=True)])
+    try:
+        vertices, faces, *_ = mesh_boolean(surface.vertices, surface.faces.astype(np.int64), vertices, faces, "union")
+    except RuntimeError:
+        return None
     return Surface(np.ascontiguousarray(vertices), np.ascontiguousarray(faces))
 
 
@@ -181,36 +193,40 @@ def _bare(capture: Capture, surface: Surface) -> list[_Bare]:
         inside, outside = distance_transform_edt(view.mask), distance_transform_edt(~view.mask)
         distance = np.where(view.mask, 0.5 - inside, outside - 0.5).astype(np.float32)
         bare = away > BEYOND
-        return _Bare(view, bare, bare & ~_wide(view, radius), binary_dilation(away > BEYOND / 2, AROUND[0]), distance)
+        thin = ~_wide(view, radius)[bare]
+        return _Bare(view, np.argwhere(bare), thin, bare, binary_dilation(away > BEYOND / 2, AROUND[0]), distance)
 
     return on_cores(one, capture.views)
 
 
-def _without(of: _Bare, pieces: Sequence[Surface]) -> View:
-    """The view without the pixels of pieces that are thin in it."""
-    view, shown = of.view, np.any([_shown(piece, of) for piece in pieces], axis=0)
-    stays = ~(shown & of.thin)
+def _without(of: _Bare, covered: Bool) -> View:
+    """The view without those of its bare pixels that are covered (n,) and thin."""
+    view, stays = of.view, np.ones_like(of.bare)
+    stays[tuple(of.pixels[covered & of.thin].T)] = False
     return replace(view, mask=view.mask & stays, samples=view.samples[stays[view.mask]])
 
 
-def _slender(piece: Surface, views: Sequence[_Bare]) -> bool:
-    """Whether most of the bare pixels that a piece covers are of thin parts of the masks."""
-    shown = [_shown(piece, of) for of in views]
-    return 2 * sum(int((one & of.thin).sum()) for one, of in zip(shown, views, strict=True)) > sum(int(one.sum()) for one in shown)
+def _covered(pieces: Sequence[_Piece]) -> list[Bool]:
+    """(n,) of each view, which bare pixels some piece covers."""
+    return [np.any(of_view, axis=0) for of_view in zip(*(piece.covers for piece in pieces), strict=True)]
 
 
-def _shown(piece: Surface, of: _Bare) -> Bool:
-    """(height, width) bare pixels of a view that a piece covers."""
-    pixels, found = np.argwhere(of.bare), np.zeros_like(of.bare)
-    found[tuple(pixels[camera_hits(ray_caster(piece), of.view.camera, pixels).face >= 0].T)] = True
-    return found
-
-
-def _found(capture: Capture, surface: Surface) -> tuple[list[_Bare], list[Surface]]:
+def _found(capture: Capture, surface: Surface) -> tuple[list[_Bare], list[_Piece]]:
     """What of the masks a surface lacks, and the pieces of T that explain it."""
     hull, views = hull_grid(capture), _bare(capture, surface)
     pieces = [piece for nodes in _where(views, hull) for piece in _pieces(views, hull, nodes)]
     return views, [piece for piece in _needed(views, pieces) if _slender(piece, views)]
+
+
+def _covering(surface: Surface, views: Sequence[_Bare]) -> _Piece:
+    caster = ray_caster(surface)
+    return _Piece(surface, [camera_hits(caster, of.view.camera, of.pixels).face >= 0 for of in views])
+
+
+def _slender(piece: _Piece, views: Sequence[_Bare]) -> bool:
+    """Whether most of the bare pixels that a piece covers are thin."""
+    of_views = list(zip(piece.covers, views, strict=True))
+    return 2 * sum(int((covers & of.thin).sum()) for covers, of in of_views) > sum(int(covers.sum()) for covers, _ in of_views)
 
 
 def _outside(views: Sequence[_Bare], points: Float) -> tuple[Float, Int, Int]:
@@ -250,7 +266,7 @@ def _where(views: Sequence[_Bare], hull: SignedDistanceGrid) -> Iterator[Bool]:
         yield binary_dilation(numbers == k, AROUND)
 
 
-def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> list[Surface]:
+def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> list[_Piece]:
     """Connected parts of T, and of what masks hold for ROOT around, about some nodes (x, y, z) of the hull's grid."""
     where = np.argwhere(nodes)
     low, high = where.min(0), where.max(0) + 1
@@ -268,7 +284,9 @@ def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> li
     values = np.full(inside.shape, spacing, np.float32)
     values[tuple(fine.T)] = np.where(reached, np.minimum(outside, spacing), spacing)
     vertices, faces, _, _ = marching_cubes(values, 0.0)
-    return pieces_of(_smooth(Surface(origin + spacing * vertices.astype(np.float64), faces.astype(np.int64))))
+    whole = _smooth(Surface(origin + spacing * vertices.astype(np.float64), faces.astype(np.int64)))
+    fewer = decimated(whole, len(whole.faces) // KEPT)
+    return [_covering(piece, views) for piece in pieces_of(fewer or whole)]
 
 
 def _smooth(surface: Surface) -> Surface:
@@ -280,15 +298,14 @@ def _smooth(surface: Surface) -> Surface:
     return Surface(np.array(mesh.vertices), surface.faces)
 
 
-def _needed(views: Sequence[_Bare], pieces: Sequence[Surface]) -> list[Surface]:
+def _needed(views: Sequence[_Bare], pieces: Sequence[_Piece]) -> list[_Piece]:
     """Pieces that cover bare pixels which those before them do not, the one that covers most of them first."""
-    shown, kept = [[_shown(piece, of) for of in views] for piece in pieces], list[Surface]()
-    left = [of.bare for of in views]
+    left, kept = [np.ones(len(of.pixels), bool) for of in views], list[_Piece]()
     while len(kept) < len(pieces):
-        gains = [sorted(int((one & free).sum()) for one, free in zip(of, left, strict=True)) for of in shown]
+        gains = [sorted(int((covers & free).sum()) for covers, free in zip(piece.covers, left, strict=True)) for piece in pieces]
         best = int(np.argmax([sum(gain) for gain in gains]))
         if gains[best][-2] < EVIDENCE:
             break
         kept.append(pieces[best])
-        left = [free & ~one for one, free in zip(shown[best], left, strict=True)]
+        left = [free & ~covers for covers, free in zip(pieces[best].covers, left, strict=True)]
     return kept

@@ -95,7 +95,7 @@ def test_rods_are_found_and_nothing_else(width: float) -> None:
     assert len(DIRECTIONS) <= len(pieces) <= 2 * len(DIRECTIONS)
     of_rods = as_surface(trimesh.util.concatenate([ball(), *rods(width)]))
     # Beside the ball pieces hold what masks leave of the corner there.
-    assert all(np.quantile(away(piece.vertices, of_rods), 0.8) < 1 for piece in pieces)
+    assert all(np.quantile(away(piece.surface.vertices, of_rods), 0.8) < 1 for piece in pieces)
 
 
 @pytest.mark.parametrize("width", [1.0, 2.0])
