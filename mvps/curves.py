@@ -20,7 +20,7 @@ from mvps.calibrate import uncalibrated_lights
 from mvps.checks.radiometry import BETTER
 from mvps.cores import on_cores
 from mvps.device import chosen_device
-from mvps.hull import default_cells, hull_of_masks, signed_distance
+from mvps.hull import hull_grid, hull_of_masks
 from mvps.joint.refine import refine
 from mvps.joint.thinned import thinned
 from mvps.own_units import in_lengths, own_length
@@ -63,7 +63,7 @@ def misfit(capture: Capture, exponent: float) -> float:
     """-log likelihood of a sample of the capture, whose radiances are codes to the power of `exponent`, but for a constant."""
     capture = levels(capture)[-1]
     capture = in_lengths(capture, own_length([view.camera for view in capture.views]))
-    hull = hull_of_masks(capture, signed_distance(capture, default_cells(capture)))
+    hull = hull_of_masks(capture, hull_grid(capture))
     # The same wherever the reconstruction runs, that others may undo the same.
     seed, device = 0, chosen_device("cpu")
     lights = uncalibrated_lights(capture, hull, seed).lights

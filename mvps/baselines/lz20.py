@@ -37,7 +37,7 @@ from mvps.baselines.lz20_brdf import BASES, SHARPNESS, mixture
 from mvps.baselines.lz20_points import LEAST_VIEWS, confident, seen_by, tangents_at, tensors
 from mvps.baselines.lz20_surface import ROUNDS, moved
 from mvps.camera import pixel_footprint
-from mvps.hull import default_cells, signed_distance, visual_hull
+from mvps.hull import hull_grid, visual_hull
 from mvps.mesh import normalise, vertex_normals
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError, Float, Lights, Material, Reconstruction, View
@@ -57,7 +57,7 @@ def lz20(capture: Capture, lights: Lights, progress: Progress) -> Reconstruction
         maps = azimuths(capture, lights)
         images = [tensors(view, of) for view, of in zip(capture.views, maps, strict=True)]
     with progress.stage("visual hull") as stage:
-        surface = visual_hull(signed_distance(capture, default_cells(capture)))
+        surface = visual_hull(hull_grid(capture))
         stage.status(f"{len(surface.vertices)} vertices")
     with progress.stage("points, contours and surface", total=sum(plan.fusions for plan in ROUNDS)) as stage:
         pixel = pixel_footprint([view.camera for view in capture.views], (surface.vertices.min(0) + surface.vertices.max(0)) / 2)

@@ -37,7 +37,7 @@ from mvps.baselines.pj16_domain import Domain, flattened, warped
 from mvps.baselines.pj16_stereo import TexelNormals, lights_on, texel_normals
 from mvps.calibrate import MINIMUM_LIGHTS, Calibration, uncalibrated_lights
 from mvps.camera import surface_pixel
-from mvps.hull import default_cells, signed_distance, visual_hull
+from mvps.hull import hull_grid, visual_hull
 from mvps.mesh import face_normals, isotropic_remesh, lengths, normalise, vertex_normals
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError, Float, Lights, Material, Reconstruction, SignedDistanceGrid, Surface, View
@@ -80,7 +80,7 @@ def pj16(capture: Capture, seed: int, progress: Progress) -> Reconstruction:
     """
     _check(capture)
     with progress.stage("visual hull"):
-        coarse = signed_distance(capture, default_cells(capture))
+        coarse = hull_grid(capture)
         surface = visual_hull(coarse)
         pixel = surface_pixel(capture, surface)
     moved: Float = np.zeros(1)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mvps.calibrate import MINIMUM_LIGHTS, uncalibrated_lights
 from mvps.device import Device, chosen_device
-from mvps.hull import default_cells, signed_distance, visual_hull
+from mvps.hull import hull_grid, visual_hull
 from mvps.joint.bundle import Model, aligned, part, prediction_errors, solved
 from mvps.joint.lighting import LIGHT_VERTICES
 from mvps.joint.refine import RefineSettings, RoundSettings, refine
@@ -32,7 +32,7 @@ ROUNDS = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(2.5, 2.
 
 def quick_model(capture: Capture, device: Device) -> Model:
     """Surface, lights, and what a part of the vertices were solved to."""
-    surface = visual_hull(signed_distance(capture, default_cells(capture)))
+    surface = visual_hull(hull_grid(capture))
     lights = uncalibrated_lights(capture, surface, 0).lights
     maps = normal_maps(*thinned(capture, lights), device)
     plan = RefineSettings(ROUNDS, half=True)

@@ -26,7 +26,7 @@ from mvps.checks.prediction import BRIGHT_QUANTILE
 from mvps.cores import on_cores
 from mvps.correlation import is_glossy
 from mvps.finding import Finding
-from mvps.hull import default_cells, signed_distance, visual_hull
+from mvps.hull import hull_grid, visual_hull
 from mvps.pbr import linear_of_srgb
 from mvps.relief.silhouette import inflated_normals
 from mvps.scene import Capture, Float, View
@@ -127,7 +127,7 @@ def is_metal(capture: Capture) -> bool:
         view = capture.views[0]
         image = np.where(view.shown, view.samples.mean(-1) * view.scale, np.nan)
         return is_glossy([image], [inflated_normals(view.mask)], np.random.default_rng(0))
-    return is_metallic(capture, visual_hull(signed_distance(capture, default_cells(capture))), 0)
+    return is_metallic(capture, visual_hull(hull_grid(capture)), 0)
 
 
 def curve_undone(capture: Capture) -> tuple[Capture, list[Finding]]:
