@@ -6,8 +6,8 @@ the codes, which is the same for all exponents,
 
     -log likelihood of a sample  =  mean log (s / I) - log e  =  mean log (s / rms I) + mean log (rms I / geometric mean I) - log e
 
-s / rms I is what Stage II leaves unexplained (joint/refine.py) on the hull: enough to tell, in a few seconds each. Exponents are tried in
-steps from 1 upwards until they get worse; between the steps the likelihood is a parabola.
+s / rms I is what Stage II leaves unexplained in the light (joint/refine.py) on the hull: enough to tell, in a few seconds each. Exponents
+are tried in steps from 1 upwards until they get worse; between the steps the likelihood is a parabola.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def misfit(capture: Capture, exponent: float) -> float:
     lights = uncalibrated_lights(capture, hull, seed).lights
     maps = normal_maps(*thinned(capture, lights), device)
     refined = refine(capture, hull, lights, maps, Parts().law(), first_pass(True, False), seed, device, lambda *_: None)
-    left = refined.unexplained[refined.unexplained > 0]
+    left = refined.in_light[refined.in_light > 0]
     return float(np.log(left).mean()) + contrast(capture) - float(np.log(exponent)) if len(left) else np.inf
 
 

@@ -14,11 +14,13 @@ by patches and with a way back). The mean of L over what is seen,
 
     hidden_px = mean of L, pixels,
 
-says how far off the surface is likely to be for this alone. Of small pits what the model explains of the whole object says nothing, and
+says how far off the surface is likely to be for this alone. Whether pits belong there is told by
 
-    misfit = mean of min(u, 1)^2 over what is seen within the balls
+    misfit = mean of min(u, 1)^2 over the pixels of all views
 
-does: few samples, or dark ones, have u without bounds.
+(few samples, or dark ones, have u without bounds). Over vertices it would grow as soon as a pit shows more of a hollow's inside. The
+rougher a pit, the more of it lies beside what hides it, where no sample tells u: there it is as at the nearest vertex that has one, for
+what is left out would fit.
 """
 
 from __future__ import annotations
@@ -28,10 +30,11 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
+from mvps.camera import view_directions
 from mvps.cores import neighbours
 from mvps.mesh import vertex_areas, vertex_normals
-from mvps.scene import Bool, Float, Int, SignedDistanceGrid, Surface
-from mvps.visibility import ray_caster
+from mvps.scene import Bool, Capture, Float, Int, SignedDistanceGrid, Surface
+from mvps.visibility import ray_caster, visible_vertices
 
 MISFIT = 0.2
 """Share of its signal that a vertex leaves unexplained from which it lies on no surface, or on one that the model does not know: twice what
@@ -81,12 +84,19 @@ def pits(surface: Surface, unexplained: Float, spacing: float) -> Float:
     return np.where(depth >= spacing, depth, 0)
 
 
-def misfit(surface: Surface, unexplained: Float, centre: Float, radius: Float) -> float:
-    """The misfit of a surface, whose vertices leave the shares `unexplained` (V,), within balls with centres (n, 3) and radii (n,); 1 where
-    nothing of it there is seen, which explains nothing."""
-    distance, nearest = neighbours(cKDTree(centre), surface.vertices)
-    share = unexplained[(distance <= radius[nearest]) & np.isfinite(unexplained)]
-    return float((share.clip(max=1) ** 2).mean()) if len(share) else 1.0
+def misfit(capture: Capture, surface: Surface, unexplained: Float) -> float:
+    """The misfit of a surface, whose vertices leave the shares `unexplained` (V,), NaN where no sample tells; 1 where none does anywhere,
+    which explains nothing."""
+    caster, looks = ray_caster(surface), np.zeros(len(unexplained))
+    for view in capture.views:
+        facing = (caster.vertex_normals * view_directions(view.camera, surface.vertices)).sum(1)
+        looks += visible_vertices(caster, view.camera) * facing.clip(0)
+    told = np.isfinite(unexplained)
+    if not (told.any() and looks.any()):
+        return 1.0
+    share = unexplained.copy()
+    share[~told] = unexplained[told][neighbours(cKDTree(surface.vertices[told]), surface.vertices[~told])[1]]
+    return float(np.average(share.clip(max=1) ** 2, weights=looks * vertex_areas(surface)))
 
 
 def solid(surface: Surface, like: SignedDistanceGrid) -> SignedDistanceGrid:

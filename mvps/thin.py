@@ -145,7 +145,8 @@ def _carried_over(refined: Refined, surface: Surface) -> Refined:
     material = interpolated(refined.material, Detailed(surface, share))
     normal = np.where(there[:, None], material.normal, vertex_normals(surface))
     material = replace(material, normal=normal, confidence=np.where(there, material.confidence, 0))
-    return replace(refined, surface=surface, material=material, unexplained=np.where(there, refined.unexplained[same], np.nan))
+    unexplained, in_light = (np.where(there, left[same], np.nan) for left in (refined.unexplained, refined.in_light))
+    return replace(refined, surface=surface, material=material, unexplained=unexplained, in_light=in_light)
 
 
 def _widened(maps: NormalMap, rest: View, whole: View) -> NormalMap:

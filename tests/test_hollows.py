@@ -8,18 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from sphere_scene import make_sphere
+from sphere_scene import RADIUS, make_sphere
 
+import mvps.digging
 from mvps.coarse import begin, tells_of_hollows
-from mvps.digging import MOST_TURNS, hollowed, pitted
-from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, mean_depth, misfit, pits, solid, thickness
+from mvps.digging import MOST_TURNS, hollowed, pitted, while_it_helps
+from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, misfit, solid, thickness
 from mvps.hull import visual_hull
 from mvps.mesh import vertex_areas, vertex_normals
 from mvps.passes import stage_two
 from mvps.plan import Parts, carving_pass
 from mvps.progress import Progress
 from mvps.reconstruct import Settings
-from mvps.scene import Float, SignedDistanceGrid, Surface
+from mvps.scene import Capture, Float, SignedDistanceGrid, Surface
 from mvps.synthetic.scene import Scene, make_cameras, make_lights, render_capture
 from mvps.synthetic.settings import SceneSettings
 from mvps.synthetic.shape import make_material
@@ -129,44 +130,71 @@ def with_surface(surface: Surface, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("left", "made", "kept"),
     [
-        ((0.01,), 0, 0),
-        ((1.0, 1.1, 0.8, 0.01, 0.005), 4, 4),
-        ((1.0, 1.1, 1.2, 1.1, 1.3), 4, 0),
-        ((1.0, 1.1, 0.92, 1.1, 0.95), 4, 0),
-        ((1.0, 0.8, 0.6, 0.7, 0.5, 0.55, 0.56, 0.6, 0.6), 8, 4),
-        ((1.0, 1.1, 1.2, 0.9, 0.95, 0.01), 5, 3),
-        ((1.0, 0.01, 0.005), 2, 2),
-        (tuple(0.9815**k for k in range(100)), 2 * MOST_TURNS * (MOST_TURNS + 1), 2 * MOST_TURNS * (MOST_TURNS + 1)),
+        ((0.5,), 0, 0),
+        ((0.5, 0.4), 1, 1),
+        ((0.5, 0.6), 1, 0),
+        ((0.5, 0.52, 0.5), 2, 0),
+        ((0.5, 0.52, 0.4, 0.5), 3, 2),
+        ((0.5, 0.48, 0.4, 0.41, 0.42), 4, 2),
+        (tuple(0.8**k for k in range(100)), MOST_TURNS, MOST_TURNS),
     ],
-    ids=["no sign", "better in the end", "worse", "hardly better", "two turns, the second worse", "half as deep", "one pit", "ever better"],
+    ids=["no sign", "there", "worse", "alike", "there after two", "pit in pit", "ever better"],
+)
+def test_pits_follow_while_they_help(left: tuple[float, ...], made: int, kept: int) -> None:
+    """left: the misfit as it was found and after every pit."""
+    found: Any = SimpleNamespace(number=0, rounds=[{}])
+
+    def dig(of: Any) -> Any:
+        assert of.number == len(dug), "into the last"
+        if len(dug) + 1 == len(left):
+            return None
+        dug.append(SimpleNamespace(number=len(dug) + 1, rounds=[{"number": len(dug) + 1}]))
+        return dug[-1]
+
+    dug: list[Any] = []
+    best, rounds = while_it_helps(found, dig, lambda of: left[of.number])
+    assert len(dug) == made and best.number == kept and [one["number"] for one in rounds] == list(range(1, kept + 1))
+
+
+def with_misfits(left: tuple[float, ...], wide: Surface, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Every round of Stage II, and what was found before, leaves what `left` says of what lies on top; the names of the rounds as they are
+    made."""
+    bad, values, made = patch_on_top(cylinder()) > 0.5, iter(left), list[str]()
+
+    def refined(name: str, *given: Any) -> Any:
+        made.append(name)
+        number = {"number": float(len(made) - 1)}
+        return SimpleNamespace(surface=wide, unexplained=np.where(bad, next(values), 0.0), maps=(), carried=None, rounds=[number])
+
+    monkeypatch.setattr("mvps.digging.stage_two", refined)
+    monkeypatch.setattr("mvps.hollows.misfit", lambda _, __, unexplained: np.nanmax(unexplained))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("left", "made", "kept"),
+    [
+        ((0.01,), 0, 0),
+        ((1.0, 1.1, 1.3, 0.8, 0.01, 0.7), 5, 3),
+        ((1.0, 1.1, 1.3, 1.1, 1.1, 1.3, 1.3), 6, 0),
+        ((1.0, 1.1, 1.3, 0.92, 1.1, 1.3, 0.95), 6, 0),
+        ((1.0, 0.7, 0.8, 0.9, 0.01, 0.6), 5, 2),
+        ((1.0, 0.7, 0.8, 0.75, 0.01, 0.6), 5, 3),
+        ((1.0, 1.1, 1.3, 1.1, 0.85, 0.01, 0.9), 6, 2),
+        ((1.0, 0.01, 0.005), 2, 2),
+    ],
+    ids=["no sign", "Stage I helps", "worse", "hardly better", "Stage I fills it", "Stage I is alike", "half as deep", "one pit"],
 )
 def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """left: what the patch leaves unexplained, as found and after every round. Two rounds (pit, Stage I) are a turn at least."""
-    capture = make_sphere(3).capture
+    """left: what the patch leaves unexplained, as found and after every round. A pit that is no better and Stage I after it are a turn at
+    least."""
     surface = cylinder()
     wide = Surface(surface.vertices * 40, surface.faces)
-    bad = patch_on_top(surface) > 0.5
-    counted = iter(range(1, 200))
-    values = iter(left)
-
-    def refined() -> Any:
-        unexplained = np.where(bad, next(values), 0.0)
-        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), carried=None, rounds=[{"number": float(next(counted))}])
-
-    repeated: dict[str, set[bool]] = {}
-
-    def stage_two(name: str, *given: Any) -> Any:
-        repeated.setdefault(name, set()).add(np.isfinite(given[3].rounds[0].still))
-        return refined()
-
-    monkeypatch.setattr("mvps.digging.stage_two", stage_two)
+    names = with_misfits(left, wide, monkeypatch)
     with_surface(wide, monkeypatch)
-    found = refined()
-    best, rounds = hollowed(capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
-    assert next(counted) - 2 == made and len(rounds) == kept
-    # Pits are dug on after a round each; where Stage I has been, vertices come to rest.
-    assert repeated in ({}, {"hollows": {False}, "coarse refinement": {True}})
-    assert (best is found) == (kept == 0)
+    found = mvps.digging.stage_two("found")  # type: ignore[call-arg]
+    best, rounds = hollowed(make_sphere(3).capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
+    assert len(names) - 1 == made and len(rounds) == kept and (best is found) == (kept == 0)
 
 
 @pytest.mark.parametrize(
@@ -175,75 +203,49 @@ def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept
     ids=["no wide hollow", "nothing left", "less left than it took to begin"],
 )
 def test_after_a_dig_less_may_be_hidden(depths: tuple[float, ...], made: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """depths: what may be hidden, pixels, before each turn and after each pit; made: rounds, one a pit and one after Stage I."""
-    surface, told, left = cylinder(), iter(depths), iter(0.5**k for k in range(20))
-
-    def refined(*_: Any) -> Any:
-        return SimpleNamespace(surface=surface, unexplained=np.full(3, next(left)), maps=(), carried=None, rounds=[{}])
-
+    """depths: what may be hidden, pixels, before each pit; made: rounds, one a pit and one after Stage I."""
+    surface, told = cylinder(), iter(depths)
+    with_misfits(tuple(0.5**k for k in range(20)), surface, monkeypatch)
+    with_surface(surface, monkeypatch)
     monkeypatch.setattr("mvps.camera.surface_pixel", lambda *_: 1.0)
     monkeypatch.setattr("mvps.hollows.hidden", lambda *_: next(told))
-    monkeypatch.setattr("mvps.digging.stage_two", refined)
-    with_surface(surface, monkeypatch)
-    found = refined()
+    found = mvps.digging.stage_two("found")  # type: ignore[call-arg]
     _, rounds = hollowed(make_sphere(3).capture, None, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
     assert len(rounds) == made and next(told, None) is None
 
 
-def test_misfit_is_of_what_is_seen_in_the_balls() -> None:
-    surface = cylinder()
-    top = np.array([[0.0, 0.0, 2.0]])
-    inside = np.linalg.norm(surface.vertices - top, axis=1) <= 0.3
-    unexplained = np.where(inside, 0.5, 7.0)
-    unexplained[np.flatnonzero(inside)[0]] = np.nan
-    assert misfit(surface, unexplained, top, np.array([0.3])) == pytest.approx(0.25)
+def test_misfit_is_of_what_views_show() -> None:
+    scene = make_sphere(3)
+    surface, capture = scene.reconstruction.surface, scene.capture
+    assert misfit(capture, surface, np.full(len(surface.vertices), 0.5)) == pytest.approx(0.25)
     # A sample of next to nothing counts as one that the model says nothing of.
-    assert misfit(surface, np.full(len(inside), 1e8), top, np.array([0.3])) == 1
-    # What no view sees there explains nothing.
-    assert misfit(surface, unexplained, top + 9, np.array([0.3])) == 1
+    assert misfit(capture, surface, np.full(len(surface.vertices), 1e8)) == 1
+    assert misfit(capture, surface, np.full(len(surface.vertices), np.nan)) == 1
+    # What no sample tells is as what lies beside it.
+    left, above = np.where(surface.vertices[:, 2] > 0, 0.5, 0.1), np.abs(surface.vertices[:, 2]) > 0.2 * RADIUS
+    assert misfit(capture, surface, np.where(above, left, np.nan)) == pytest.approx(misfit(capture, surface, left), rel=0.05)
+    out_of_sight = Surface(surface.vertices + 100 * RADIUS, surface.faces)
+    assert misfit(capture, out_of_sight, np.zeros(len(surface.vertices))) == 1
+    one = Capture("one", capture.views[:1])
+    centre, away = capture.views[0].camera.centre, np.linalg.norm(capture.views[0].camera.centre)
+    facing = vertex_normals(surface) @ (centre / away)
+    # A picture of the ball reaches as far as it is seen, and this far what is turned towards the camera by up to 60 deg.
+    whole, inner = (RADIUS * np.sqrt(1 - cosine**2) / (away - RADIUS * cosine) for cosine in (RADIUS / away, 0.5))
+    assert misfit(one, surface, np.where(facing > 0.5, 0.0, 1.0)) == pytest.approx(1 - (inner / whole) ** 2, rel=0.05)
+    assert misfit(one, surface, np.where(facing > RADIUS / away, 0.0, 1.0)) < 0.01
 
 
-def test_pits_are_what_the_grid_can_hold() -> None:
-    surface = cylinder()
-    unexplained = patch_on_top(surface)
-    depth, wide = pits(surface, unexplained, 0.3), clearance(surface, unexplained)
-    assert (depth[wide >= 0.3] == wide[wide >= 0.3]).all() and not depth[wide < 0.3].any() and 0 < (depth > 0).sum() < (wide > 0).sum()
-    assert mean_depth(surface, unexplained, depth) < hidden(surface, unexplained)
-
-
-@pytest.mark.parametrize(
-    ("left", "made", "kept"),
-    [
-        ((0.1,), 0, 0),
-        ((0.6, 0.1), 1, 1),
-        ((0.6, 0.52), 1, 0),
-        ((0.6, 0.5, 0.15), 2, 2),
-        ((0.6, 0.5, 0.45), 2, 0),
-        ((0.9, 0.6, 0.4, 0.35), 3, 2),
-        ((0.8, 1e8), 1, 0),
-    ],
-    ids=["no sign", "there", "hardly better", "there after two", "not after two", "pit in pit", "worse"],
-)
-def test_pits_stay_that_halve_what_is_left_unexplained_in_them(
-    left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("left", "made", "kept"), [((0.1,), 0, 0), ((0.6, 0.5, 0.1), 2, 2), ((0.6, 0.57, 0.65), 2, 0)])
+def test_pits_stay_where_less_is_left_unexplained(left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """left: what the patch leaves unexplained, as found and after every round."""
-    capture = make_sphere(3).capture
     surface = cylinder()
     wide = Surface(surface.vertices * 40, surface.faces)
-    bad = patch_on_top(surface) > 0.5
-    values, counted = iter(left), iter(range(1, 200))
-
-    def refined() -> Any:
-        unexplained = np.where(bad, next(values), 0.0)
-        return SimpleNamespace(surface=wide, unexplained=unexplained, maps=(), carried=None, rounds=[{"number": float(next(counted))}])
-
-    monkeypatch.setattr("mvps.digging.stage_two", lambda *_: refined())
-    monkeypatch.setattr("mvps.hollows.dug", lambda *_: None)
-    monkeypatch.setattr("mvps.hull.visual_hull", lambda *_: wide)
-    found, grid = refined(), SignedDistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 2.0)
-    best, rounds = pitted(capture, grid, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
-    assert next(counted) - 2 == made and len(rounds) == kept and (best is found) == (kept == 0)
+    names = with_misfits(left, wide, monkeypatch)
+    with_surface(wide, monkeypatch)
+    found = mvps.digging.stage_two("found")  # type: ignore[call-arg]
+    grid = SignedDistanceGrid(np.zeros((2, 2, 2)), np.zeros(3), 2.0)
+    best, rounds = pitted(make_sphere(3).capture, grid, found, Settings("somewhere"), carving_pass(True), None)  # type: ignore[arg-type]
+    assert names[1:] == ["pits"] * made and len(rounds) == kept and (best is found) == (kept == 0)
 
 
 def vessel(settings: SceneSettings) -> Scene:
@@ -282,7 +284,6 @@ def test_a_vessel_is_hollow() -> None:
     true, before, after = (
         ray_caster(one).first_hits(above, down).distance[0] - top for one in (scene.surface, bridged.surface, found.surface)
     )
-    # Of 82: -4 on the bridge, 52 measured (59 with normals of one weight in the fusion). Two pits, one into the other, and a round after
-    # Stage I.
-    assert before < 0.1 * true < 0.5 * true < after < 1.05 * true and len(rounds) >= 3
+    # Of 82: -4 on the bridge, 63 measured (52 where Stage I had the last word). Two pits, one into the other.
+    assert before < 0.1 * true < 0.5 * true < after < 1.05 * true and len(rounds) >= 2
     assert np.nanmean(found.unexplained) < 0.6 * np.nanmean(bridged.unexplained)

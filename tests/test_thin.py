@@ -72,7 +72,7 @@ def solved(surface: Surface, capture: Capture) -> Refined:
     towards = [np.tile(-view.camera.rotation[2], (count, 1)) for view, count in zip(capture.views, pixels, strict=True)]
     maps = tuple(NormalMap(t, np.ones((len(t), 3)), np.full(len(t), 0.8)) for t in towards)
     lights = Lights(tuple(t[:1] for t in towards), (np.ones((1, 3)),) * len(towards), False)
-    return Refined(surface, material, lights, maps, Law((20.0,)), [], [], "converged", "", np.full(n, 0.01))
+    return Refined(surface, material, lights, maps, Law((20.0,)), [], [], "converged", "", *np.full((2, n), 0.01))
 
 
 def away(points: Float, surface: Surface) -> Float:
@@ -144,7 +144,8 @@ def test_a_result_has_the_rods_that_it_lacked(width: float) -> None:
     old = distance == 0
     assert old.sum() > 0.9 * len(before.surface.vertices)
     assert np.allclose(found.material.confidence[old], 0.9) and not found.material.confidence[~old].any()
-    assert np.isnan(found.unexplained[~old]).all() and np.allclose(found.unexplained[old], 0.01)
+    for left in (found.unexplained, found.in_light):
+        assert np.isnan(left[~old]).all() and np.allclose(left[old], 0.01)
     for maps, view, less in zip(found.maps, capture.views, rest.views, strict=True):
         assert len(maps.normal) == len(view.pixels)
         assert np.allclose(maps.confidence, np.where(less.mask[view.mask], 0.8, 0))

@@ -103,25 +103,34 @@ def _rows_of_one(matrix: sp.csr_matrix) -> sp.csr_matrix:
     return scaled
 
 
-def _shown(of: Observed, i: int) -> tuple[Float, Bool]:
-    """(n, lights) which share of a light view i shows to reach the vertices that it sees, and where it shows that at all."""
+class Shown(NamedTuple):
+    """Of n vertices and some lights, (n, lights) each: share of a light that a photograph shows to reach the vertex, f; whole, what it then
+    brings, q R; clear, where that is told at all."""
+
+    share: Float
+    whole: Float
+    clear: Bool
+
+
+def shown_light(of: Observed, i: int) -> Shown:
+    """What view i shows of lights on the vertices that it sees."""
     samples, index, lights = of.views[i], of.views[i].vertex, of.lights[i]
     shaded = evaluate(of.vertices.normal[index], of.vertices.reflectance[index], samples.towards, lights, of.law, samples.gathered)
-    sent, image, whole, cosine = (t.cpu().numpy() for t in (shaded.rest, samples.image, shaded.predicted, shaded.n_dot_l))
+    sent, image, predicted, cosine = (t.cpu().numpy() for t in (shaded.rest, samples.image, shaded.predicted, shaded.n_dot_l))
     low, high = HALF_LIT
-    clear = (cosine > LEAST_COSINE) & (whole > sent)
+    clear, whole = (cosine > LEAST_COSINE) & (predicted > sent), predicted - sent
     with np.errstate(over="ignore"):
         # Of what reflects next to nothing any light is all of it.
-        lit = np.clip(((image - sent) / np.where(clear, whole - sent, 1) - low) / (high - low), 0, 1)
+        lit = np.clip(((image - sent) / np.where(clear, whole, 1) - low) / (high - low), 0, 1)
     points = of.surface.vertices[index.cpu().numpy()]
-    return np.where(saturated(of.capture.views[i], points), 1, lit), clear
+    return Shown(np.where(saturated(of.capture.views[i], points), 1, lit), whole, clear)
 
 
 def _of_view(of: Observed, i: int, caster: RayCaster, gradient: list[sp.csr_matrix], pixel: float) -> Borders:
     rows, direction = of.views[i].vertex.cpu().numpy(), of.lights[i].direction.cpu().numpy()
     normal = caster.vertex_normals[rows].astype(np.float32)
     n_dot_l = normal @ direction.T
-    lit, clear = _shown(of, i)
+    lit, _, clear = shown_light(of, i)
     clear = clear & (n_dot_l > LEAST_COSINE)
     distance = distances_to_shade(caster, rows, direction.astype(np.float64))
     hidden = np.isfinite(distance)

@@ -36,6 +36,7 @@ from mvps.joint.shown import OWN_SHARE, own_normals, shaded_as
 from mvps.joint.state import State, grey_albedo, material_of, relative_residuals, senders_in_colour
 from mvps.joint.stated import scatter, stated_errors
 from mvps.joint.strengths import unknown_of
+from mvps.joint.unexplained import unexplained_share
 from mvps.joint.unseen import closed_over
 from mvps.joint.vertices import Moved, fuse, with_masks
 from mvps.material import LARGEST, POOR_FIT, Model, Trial
@@ -132,7 +133,8 @@ class RefineSettings:
 class Refined:
     """surface, material and lights; maps: per view its pixels' normals; per round what changed; whether the last step was small, in words,
     and a sentence; unexplained (V,): what the model leaves of a vertex's samples, root mean squares as a share of the signal, NaN where no
-    view sees it; carried: the surface with what its vertices were solved to, from which later rounds may go on."""
+    view sees it (unexplained.py); in_light (V,): the same of those in the light alone; carried: the surface with what its vertices were
+    solved to, from which later rounds may go on."""
 
     surface: Surface
     material: Material
@@ -144,6 +146,7 @@ class Refined:
     status: str
     text: str
     unexplained: Float
+    in_light: Float
     carried: tuple[Surface, Vertices] | None = None
 
 
@@ -222,8 +225,8 @@ def _remeshed(
 def _in_detail(result: Refined, capture: Capture, told: Moved, seen: list[Any]) -> Refined:
     """The result on a mesh that is finer than its last round's."""
     finer = detailed(capture, told, result.maps, seen)
-    material, unexplained = interpolated(result.material, finer), finer.share @ result.unexplained
-    return replace(result, surface=finer.surface, material=material, unexplained=unexplained)
+    material, unexplained, in_light = interpolated(result.material, finer), finer.share @ result.unexplained, finer.share @ result.in_light
+    return replace(result, surface=finer.surface, material=material, unexplained=unexplained, in_light=in_light)
 
 
 def _together(lights: Lights, settings: RefineSettings) -> Together:
@@ -336,8 +339,8 @@ def finished(state: State, settings: RefineSettings, account: list[dict[str, flo
     assert state.vertices is not None
     material = _coloured(state, settings, generator) if settings.final else material_of(state, grey_albedo(state.vertices))
     status, text = _settled(account)
-    unexplained = relative_residuals(state.views, state.vertices).double().cpu().numpy()
-    return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text, unexplained)
+    left = unexplained_share(_observed(state)[0]), relative_residuals(state.views, state.vertices).double().cpu().numpy()
+    return Refined(state.surface, material, state.lights, state.maps, state.law, state.trials, account, status, text, *left)
 
 
 def _settled(account: list[dict[str, float]]) -> tuple[str, str]:
