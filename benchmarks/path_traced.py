@@ -79,6 +79,8 @@ CASES = {
     "statue-wide": Case("statue", "plastic", SceneSettings(seed=209, lights=16, spread=80)),
     "bolt-aluminium": Case("bolt", "aluminium", SceneSettings(seed=706)),
     "gem-aluminium": Case("gem", "aluminium", SceneSettings(seed=717)),
+    "windows-chalk": Case("windows", "chalk", SceneSettings(seed=903)),
+    "mug-chalk": Case("mug", "chalk", SceneSettings(seed=902)),
 }
 
 

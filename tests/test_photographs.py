@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sphere_scene import camera_at
 
 from mvps.calibrate import colour_ratios
-from mvps.checks.photographs import photographs
+from mvps.checks.photographs import FOREIGN, photographs
 from mvps.joint.colours import _ratios
 from mvps.scene import Capture, View
 from mvps.synthetic.scene import render_capture
@@ -116,3 +117,27 @@ def test_lights_of_which_no_sample_speaks_are_white() -> None:
     sums = [(np.array([[2.0, 2.2, 1.8], [0.0, 0.0, 0.0]]), np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]))]
     ratios = _ratios(sums, one_rig=False)[0]
     assert np.isfinite(ratios).all() and (ratios > 0).all() and np.allclose(ratios.mean(1), 1)
+
+
+def smooth_ball(rng: np.random.Generator, odd: bool) -> View:
+    """A white ball under twelve lights from the front; odd: one photograph holds a smooth light of its own beside its lamp's."""
+    row, column = np.indices((96, 96)) - 47.5
+    mask = np.hypot(row, column) < 40
+    normal = np.stack([column, -row, np.sqrt(np.maximum(40**2 - row**2 - column**2, 0))], -1)[mask] / 40
+    light = rng.normal(size=(12, 3)) * (0.5, 0.5, 0) + (0, 0, 1)
+    image = np.maximum(normal @ (light / np.linalg.norm(light, axis=1, keepdims=True)).T, 0)
+    if odd:
+        image[:, LIGHT] += 0.3 * np.sin(4 * normal[:, 0] + 1) * np.cos(4 * normal[:, 1])
+    code = 20000 * np.maximum(image + 0.003 * rng.normal(size=image.shape), 0)
+    samples = np.repeat(code.astype(np.uint16)[..., None], 3, axis=-1)
+    return View("view", camera_at(np.array([0.0, 0.0, 1.0])), mask, samples, 1 / 65535, 65535, tuple(range(1, 13)))
+
+
+@pytest.mark.parametrize("foreign", [0.0, FOREIGN])
+def test_a_smooth_object_under_another_light_is_no_other_object(foreign: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moving it changes little and it has no edges, but its light and dark lie where they are predicted."""
+    monkeypatch.setattr("mvps.checks.photographs.FOREIGN", foreign)
+    rng = np.random.default_rng(0)
+    capture = Capture("ball", tuple(replace(smooth_ball(rng, k == VIEW), name=f"view_{k}") for k in range(6)))
+    told = [one.where for one in photographs(capture)[1] if "another object" in one.text]
+    assert told == ([f"view_{VIEW}/{LIGHT + 1:03d}"] if foreign == 0 else [])

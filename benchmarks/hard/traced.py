@@ -182,6 +182,13 @@ def mug(x: Float) -> Float:
     return np.asarray(np.maximum(np.minimum(disc(x, 0.5, 0, 0.6), handle), -inside))
 
 
+def windows(x: Float) -> Float:
+    """A hollow ball, its wall a fifth of its radius thick, with a round window to either side along every axis."""
+    wall = np.abs(np.linalg.norm(x, axis=-1) - 0.71) - 0.09
+    pipes = np.min([np.linalg.norm(np.delete(x, axis, -1), axis=-1) - 0.3 for axis in range(3)], axis=0)
+    return np.asarray(np.maximum(wall, -pipes))
+
+
 def six_sides(x: Float) -> Float:
     """Distance (n,) to the z axis across the nearest side of a hexagon around it."""
     towards = np.array([0, 1, 2]) * np.pi / 3
@@ -239,6 +246,7 @@ SHAPES: dict[str, Callable[[], Function]] = {
     "bricks": lambda: bricks,
     "gear": lambda: gear,
     "mug": lambda: mug,
+    "windows": lambda: windows,
     "nut": lambda: nut,
     "coin": lambda: coin,
     "steps": lambda: steps,
