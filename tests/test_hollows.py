@@ -13,7 +13,7 @@ from sphere_scene import RADIUS, make_sphere
 import mvps.digging
 from mvps.coarse import begin, tells_of_hollows
 from mvps.digging import MOST_TURNS, hollowed, pitted, while_it_helps
-from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, misfit, solid, thickness
+from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, mean_depth, misfit, pits, solid, thickness
 from mvps.hull import visual_hull
 from mvps.mesh import vertex_areas, vertex_normals
 from mvps.passes import stage_two
@@ -158,11 +158,13 @@ def test_pits_follow_while_they_help(left: tuple[float, ...], made: int, kept: i
 
 def with_misfits(left: tuple[float, ...], wide: Surface, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Every round of Stage II, and what was found before, leaves what `left` says of what lies on top; the names of the rounds as they are
-    made."""
+    made. Pits are dug on after a round each; where Stage I has been, vertices come to rest."""
     bad, values, made = patch_on_top(cylinder()) > 0.5, iter(left), list[str]()
 
     def refined(name: str, *given: Any) -> Any:
         made.append(name)
+        if given:
+            assert np.isfinite(given[3].rounds[0].still) == (name == "coarse refinement")
         number = {"number": float(len(made) - 1)}
         return SimpleNamespace(surface=wide, unexplained=np.where(bad, next(values), 0.0), maps=(), carried=None, rounds=[number])
 
@@ -182,8 +184,19 @@ def with_misfits(left: tuple[float, ...], wide: Surface, monkeypatch: pytest.Mon
         ((1.0, 0.7, 0.8, 0.75, 0.01, 0.6), 5, 3),
         ((1.0, 1.1, 1.3, 1.1, 0.85, 0.01, 0.9), 6, 2),
         ((1.0, 0.01, 0.005), 2, 2),
+        (tuple(0.985**k for k in range(100)), 2 * MOST_TURNS * (MOST_TURNS + 2), 2 * MOST_TURNS * (MOST_TURNS + 2)),
     ],
-    ids=["no sign", "Stage I helps", "worse", "hardly better", "Stage I fills it", "Stage I is alike", "half as deep", "one pit"],
+    ids=[
+        "no sign",
+        "Stage I helps",
+        "worse",
+        "hardly better",
+        "Stage I fills it",
+        "Stage I is alike",
+        "half as deep",
+        "one pit",
+        "ever better",
+    ],
 )
 def test_digging_goes_on_while_it_helps(left: tuple[float, ...], made: int, kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """left: what the patch leaves unexplained, as found and after every round. A pit that is no better and Stage I after it are a turn at
@@ -233,6 +246,14 @@ def test_misfit_is_of_what_views_show() -> None:
     whole, inner = (RADIUS * np.sqrt(1 - cosine**2) / (away - RADIUS * cosine) for cosine in (RADIUS / away, 0.5))
     assert misfit(one, surface, np.where(facing > 0.5, 0.0, 1.0)) == pytest.approx(1 - (inner / whole) ** 2, rel=0.05)
     assert misfit(one, surface, np.where(facing > RADIUS / away, 0.0, 1.0)) < 0.01
+
+
+def test_pits_are_what_the_grid_can_hold() -> None:
+    surface = cylinder()
+    unexplained = patch_on_top(surface)
+    depth, wide = pits(surface, unexplained, 0.3), clearance(surface, unexplained)
+    assert (depth[wide >= 0.3] == wide[wide >= 0.3]).all() and not depth[wide < 0.3].any() and 0 < (depth > 0).sum() < (wide > 0).sum()
+    assert mean_depth(surface, unexplained, depth) < hidden(surface, unexplained)
 
 
 @pytest.mark.parametrize(("left", "made", "kept"), [((0.1,), 0, 0), ((0.6, 0.5, 0.1), 2, 2), ((0.6, 0.57, 0.65), 2, 0)])
@@ -285,5 +306,5 @@ def test_a_vessel_is_hollow() -> None:
         ray_caster(one).first_hits(above, down).distance[0] - top for one in (scene.surface, bridged.surface, found.surface)
     )
     # Of 82: -4 on the bridge, 63 measured (52 where Stage I had the last word). Two pits, one into the other.
-    assert before < 0.1 * true < 0.5 * true < after < 1.05 * true and len(rounds) >= 2
+    assert before < 0.1 * true < 0.7 * true < after < 1.05 * true and len(rounds) >= 2
     assert np.nanmean(found.unexplained) < 0.6 * np.nanmean(bridged.unexplained)
