@@ -3,7 +3,7 @@
     mesh.ply                 vertices (world frame, units of the capture), refined normals, albedo as sRGB vertex colour
     model.glb                textured physically based model;  model.obj, .mtl and textures likewise   (where textures are given)
     model_N.glb              the same with N faces;  model_N.obj, .mtl, textures and mesh_N.ply likewise   (for each N that is given)
-    lights.json              {"one_rig": bool, "views": {name: {"lights": [numbers],
+    lights.json              {"one_rig": bool, "fixed": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
                              grazing, bounce, gleam (numbers), microfacet, shadows (truth values); with a neural residual also

@@ -1,6 +1,6 @@
 """What a camera sees of a reconstruction under any light: the picture and the layers it is made of.
 
-    image = sum over lights of  visibility * E * shade(material)  +  albedo * what other surfaces send (bounce.py)
+    image = sum over lights of  visibility * E * shade(material)  +  what it returns of what other surfaces send (bounce.py, gleam.py)
 
 Every layer is the mean over SUBPIXELS rays a pixel, those that miss the surface left out; coverage is the part of them that meet it.
 With many lights each ray takes its share of them, times the number of rays: neighbours of one pixel see nearly the same point, so

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mvps.command import lights_argument, number_list, parse, parser, run, whole
+from mvps.finding import Finding
 from mvps.inputs import shown
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, parted
@@ -20,8 +21,9 @@ from mvps.scene import Capture, Lights, Reconstruction
 if TYPE_CHECKING:
     from mvps.plan import Parts
 
-Run = Callable[[Capture, Settings, Lights | None, Progress], Reconstruction]
-"""From a capture (held-out photographs included), settings and calibrated lights of the photographs used, if they were asked for."""
+Run = Callable[[Capture, Settings, Lights | None, Progress, Sequence[Finding]], Reconstruction]
+"""From a capture (held-out photographs included), settings, calibrated lights of the photographs used, if they were asked for, and what was
+found in the capture, of which our own account tells more."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +38,12 @@ class Method:
 def _ours(preset: str, parts: Callable[[], Parts] | None = None) -> Run:
     """Ours with these parts, all if None; a function makes them, for their module takes a second to import."""
 
-    def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    def run_(
+        capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]
+    ) -> Reconstruction:
         from mvps.reconstruct import reconstruct
 
-        return reconstruct(capture, replace(settings, preset=preset), lights, progress, parts() if parts else None)
+        return reconstruct(capture, replace(settings, preset=preset), lights, progress, parts() if parts else None, findings=findings)
 
     return run_
 
@@ -71,20 +75,22 @@ def _ablation(parts: Callable[[], Parts]) -> Run:
     return _ours("standard", parts)
 
 
-def _hull(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+def _hull(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]) -> Reconstruction:
     from mvps.stages import hull
 
     return hull(capture, settings, lights, progress)
 
 
-def _stage1(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+def _stage1(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]) -> Reconstruction:
     from mvps.stages import stage1
 
     return stage1(capture, settings, lights, progress)
 
 
 def _radiance(density: bool, with_normals: bool) -> Run:
-    def run_(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+    def run_(
+        capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]
+    ) -> Reconstruction:
         from mvps.stages import radiance
 
         return radiance(capture, settings, lights, progress, density, with_normals)
@@ -92,14 +98,14 @@ def _radiance(density: bool, with_normals: bool) -> Run:
     return run_
 
 
-def _pj16(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+def _pj16(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]) -> Reconstruction:
     from mvps.baselines.pj16 import pj16
 
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     return _whole(pj16(used, settings.seed, progress), capture, settings)
 
 
-def _lz20(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress) -> Reconstruction:
+def _lz20(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]) -> Reconstruction:
     from mvps.baselines.lz20 import lz20
 
     assert lights is not None
@@ -141,7 +147,7 @@ METHODS = {
     "unisurf+n": Method("the same with the loss on normals of photometric stereo", _radiance(False, True)),
     "lambert": Method("ours with albedo alone: no lobes, no inter-reflection, no neural residual", _ablation(_lambert)),
     "microfacet": Method("ours with GGX lobes in place of spherical Gaussians", _ablation(_with(microfacet=True))),
-    "fixed-light": Method("ours with the lights of the factorisation, never refined", _ablation(_with(free_lights=False))),
+    "fixed-light": Method("ours, the lights of the factorisation refined in colour alone", _ablation(_with(free_lights=False))),
     "no-visibility": Method("ours without cast shadows", _ablation(_with(shadows=False))),
     "per-view-lights": Method("ours with the lights of every view on their own", _ablation(_with(one_rig=False))),
     "no-vertex-step": Method("ours, but Stage II leaves the vertices where Stage I put them", _ablation(_with(moves=False))),
@@ -169,8 +175,8 @@ def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
     capture, findings = sound(capture, progress)
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
     lights = read_calibrated_lights(path, used) if method.calibrated else None
-    made = method.run(capture, replace(settings, calibrated_lights=method.calibrated), lights, progress)
-    metrics = {**made.metrics, "stages": progress.stages, "findings": [asdict(one) for one in findings]}
+    made = method.run(capture, replace(settings, calibrated_lights=method.calibrated), lights, progress, findings)
+    metrics = {"findings": [asdict(one) for one in findings], **made.metrics, "stages": progress.stages}
     write_reconstruction(replace(made, metrics=metrics, settings={**made.settings, "method": name}), out)
 
 

@@ -235,7 +235,7 @@ def refined_from(
         said = [f"{len(misfits)} photographs left out"] * bool(misfits) + [BY_MATERIALS] * (scatter > 0) + [BY_EXEMPLARS] * shiny
         stage.status("; ".join(said))
     # Rounds bring lights by two materials no nearer.
-    plan = parts.of(RefineSettings((), free_lights=found is not None, final=True))
+    plan = parts.of(RefineSettings((), found is not None, solved, final=True))
     with progress.stage("joint refinement", total=rounds) as stage:
 
         def on_round(_: int, changes: dict[str, float]) -> None:

@@ -62,7 +62,7 @@ def first_pass(free_lights: bool, final: bool) -> RefineSettings:
     """Rounds on the hull: lights and normals good enough for Stage I, or all there is (final). Sweeps reach as far as a hull bulges over
     shallow hollows."""
     rounds = (RoundSettings(3.0, 4.0, 0.5, photometric=False), RoundSettings(3.0, 2.0, 0.4))
-    return RefineSettings(rounds, free_lights=free_lights, final=final, for_field=not final, half=True, detail=final)
+    return RefineSettings(rounds, free_lights, free_lights, final=final, for_field=not final, half=True, detail=final)
 
 
 EASED_FUSIONS = 2
@@ -77,7 +77,7 @@ def carving_pass(free_lights: bool, eased: bool = False) -> RefineSettings:
     where the model fits; where it does not, Stage I has a turn first. eased: photographs abound and the model fits, so less of each does
     (docs/findings/stage_one.md)."""
     coarse = replace(COARSE, edge=2.5, fusions=EASED_FUSIONS) if eased else COARSE
-    return RefineSettings((coarse,), free_lights=free_lights, half=True, eased=eased)
+    return RefineSettings((coarse,), free_lights, free_lights, half=True, eased=eased)
 
 
 def once(plan: RefineSettings) -> RefineSettings:
@@ -98,4 +98,4 @@ def last_pass(preset: str, free_lights: bool, far: bool, before: list[dict[str, 
         rounds = (COARSE, *rounds)
     if eased:
         rounds = tuple(replace(one, fusions=EASED_FUSIONS) for one in rounds)
-    return RefineSettings(rounds, free_lights=free_lights, final=True, in_full=True, goes_on=before[-1]["goes_on"])
+    return RefineSettings(rounds, free_lights, free_lights, final=True, in_full=True, goes_on=before[-1]["goes_on"])

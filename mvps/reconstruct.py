@@ -142,12 +142,13 @@ def reconstruct(
     else:
         start, rounds = coarse(rest, settings, lights, parts, progress, step)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
-        free, less = lights is None and start.rounds[-1]["residual"] <= POOR_FIT, eased(settings.preset, rest, start.rounds)
+        fits, less = start.rounds[-1]["residual"] <= POOR_FIT, eased(settings.preset, rest, start.rounds)
         far = few_lights(rest) or halvings(rest) > 0
         start = replace(start, maps=()) if halvings(rest) else start
-        plan, name = parts.of(last_pass(settings.preset, free, far, rounds, less)), "joint refinement"
+        plan, name = parts.of(last_pass(settings.preset, lights is None, far, rounds, less)), "joint refinement"
+        plan = replace(plan, free_lights=plan.free_lights and fits)
         refined = step(name, lambda: stage_two(name, rest, start.surface, start, plan, settings, progress, start.carried))
-        if lights is None and not free and start.status != "converged":
+        if lights is None and not fits and start.status != "converged":
             # Lights that stay where they still turned have not settled.
             refined = replace(refined, status=start.status, text=start.text)
     refined, lacking = with_thin_parts(refined, rest, used)
@@ -294,8 +295,8 @@ def main(argv: Sequence[str]) -> None:
     kept = checkpoints_of(given.out, capture, settings, lights, given.resume)
     reconstruction = reconstruct(capture, settings, lights, progress, checkpoints=kept, findings=findings)
     write(reconstruction, capture, settings, given.out, progress)
-    for one in findings:
-        print(f"{one.where}: {one.text}")
+    for one in reconstruction.metrics["findings"]:
+        print(f"{one['where']}: {one['text']}")
     print(f"{given.out}: {reconstruction.metrics['status']['name']}. {reconstruction.metrics['status']['text']}")
 
 

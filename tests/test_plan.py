@@ -14,7 +14,7 @@ from mvps.methods import BUDGETS, METHODS
 from mvps.plan import Parts, carving_pass, first_pass, last_pass
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
-from mvps.scene import Capture, Reconstruction
+from mvps.scene import Capture, Lights, Reconstruction
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
 
@@ -48,7 +48,32 @@ def test_lights_that_stay_are_those_of_the_factorisation(capture: Capture) -> No
     assert np.abs(fixed.lights.direction[0] - free.lights.direction[0]).max() > 1e-3
 
 
+@pytest.mark.parametrize("views", [5, 1])
+def test_given_lights_stay_with_their_colours(views: int) -> None:
+    """Under lamps that are said to be orange the same photographs show a bluer object."""
+    capture, truth = render_capture(SceneSettings(views=views, lights=10, size=80))
+    colour = np.array([1.5, 1.0, 0.5])
+    white = Lights(tuple(truth.direction.values()), tuple(truth.intensity.values()), views > 1)
+    orange = replace(white, intensity=tuple(of_view * colour for of_view in white.intensity))
+    settings = Settings("made", preset="draft", calibrated_lights=True)
+    one, other = (reconstruct(capture, settings, given, Progress()) for given in (white, orange))
+    for given, made in ((white, one), (orange, other)):
+        for at in range(views):
+            scale = made.lights.intensity[at] / given.intensity[at]
+            np.testing.assert_allclose(scale, scale.mean(), rtol=1e-5)
+            np.testing.assert_allclose(made.lights.direction[at], given.direction[at], atol=1e-6)
+    bluer = np.median(other.material.albedo, 0) / np.median(one.material.albedo, 0)
+    np.testing.assert_allclose(bluer / bluer[1], 1 / colour, rtol=0.05)
+
+
 BEFORE = [{"goes_on": 0.3}]
+
+
+def test_colours_are_given_with_the_lights() -> None:
+    for free in (True, False):
+        for plan in (first_pass(free, True), carving_pass(free), last_pass("standard", free, False, BEFORE)):
+            assert plan.free_colours is free
+    assert Parts(free_lights=False).of(first_pass(True, True)).free_colours
 
 
 def test_parts_change_nothing_else() -> None:

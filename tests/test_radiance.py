@@ -74,7 +74,7 @@ Make = Callable[[str], Reconstruction]
 @pytest.fixture(scope="module")
 def made(scene: tuple[Capture, Truth]) -> Make:
     """A variant by its name, made when first asked for."""
-    return lru_cache(lambda name: METHODS[name].run(scene[0], Settings("made"), None, Progress()))
+    return lru_cache(lambda name: METHODS[name].run(scene[0], Settings("made"), None, Progress(), ()))
 
 
 @pytest.mark.parametrize("name", ["nerf", "nerf+n", "unisurf", "unisurf+n"])

@@ -123,7 +123,7 @@ def test_rounds_on_the_true_surface_come_to_the_true_strength(seen: Seen, wrong:
     """From a strength that is right, or too small: samples are lit by albedo that was solved under what arrived."""
     model = Model(bounce=True)
     state = State(seen.surface, seen.lights, (), replace(DIFFUSE, bounce=wrong * BOUNCE), model, 0.0, vertices=seen.vertices)
-    task, generator = Task(False, False, False, True, True, CPU), np.random.default_rng(0)
+    task, generator = Task(False, True, False, False, True, True, CPU), np.random.default_rng(0)
     for _ in range(3):
         assert state.vertices is not None
         photometric_round(state, seen.capture, task, (seen.surface, state.vertices), generator)
@@ -140,7 +140,7 @@ def test_where_hardly_a_sample_counts_a_round_states_a_right_angle(seen: Seen, m
 
     monkeypatch.setattr("mvps.joint.photometry.vertex_step", untold)
     state = State(seen.surface, seen.lights, (), replace(DIFFUSE, bounce=BOUNCE), Model(bounce=True), 0.0, vertices=seen.vertices)
-    task, generator = Task(False, False, False, True, True, CPU), np.random.default_rng(0)
+    task, generator = Task(False, True, False, False, True, True, CPU), np.random.default_rng(0)
     assert photometric_round(state, seen.capture, task, (seen.surface, seen.vertices), generator)["stated_error_deg"] == 90
 
 

@@ -133,8 +133,8 @@ class _OfStrengths:
 class _Sums:
     """Products of derivatives with each other, each sample divided by its vertex's residual variance.
 
-    vertices (V, p + 3, p + 3): by the vertex's p unknowns and the law's two, and the residual; count (V,) weight of a vertex's samples;
-    of each rig cross (V, p, 3, lights): by vertex and light; lights (lights, 3, 6): by light with by light, the law's two, the residual;
+    vertices (V, p + 4, p + 4): by the vertex's p unknowns, the law's three and the residual; count (V,) weight of a vertex's samples;
+    of each rig cross (V, p, 3, lights): by vertex and light; lights (lights, 3, 7): by light with by light, the law's three, the residual;
     strengths: by number of the view, where strengths are unknown.
     """
 

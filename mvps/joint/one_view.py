@@ -116,7 +116,8 @@ def refine_view(
             attempt = State(surface, lights, (maps,), law, model, dark_noise_share(capture))
         else:
             attempt = replace(state, surface=surface, lights=lights, maps=(maps,))
-        changes = photometric_round(attempt, capture, Task(settings.free_lights, False, False, False, False, device), None, generator)
+        task = Task(settings.free_lights, settings.free_colours, False, False, False, False, device)
+        changes = photometric_round(attempt, capture, task, None, generator)
         if changes["residual"] > WORSE * min((before["residual"] for before in account), default=np.inf):
             break
         state, start = attempt, following

@@ -41,11 +41,12 @@ WEAK_TIE = 0.3
 
 @dataclass(frozen=True)
 class Task:
-    """What a round is to do. free_lights: solve the lights; choose: try the components of the model first; sharpen: and solve the lobes'
-    sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every other pixel only; device:
-    of the tensors; eased: lights are solved on fewer vertices."""
+    """What a round is to do. free_lights: solve the lights; free_colours: and their colours; choose: try the components of the model first;
+    sharpen: and solve the lobes' sharpness; thinned: pixels, like vertices, under ENOUGH_LIGHTS lights of each view; half: normals of every
+    other pixel only; device: of the tensors; eased: lights are solved on fewer vertices."""
 
     free_lights: bool
+    free_colours: bool
     choose: bool
     sharpen: bool
     thinned: bool
@@ -200,7 +201,8 @@ def photometric_round(
     last = vertices.normal
     vertices = possible(vertex_step(state.views, vertices, lights, state.law, free), state.law)
     state.vertices = vertices
-    state.lights = with_colours(state, capture, few, patches.vertex)
+    if task.free_colours:
+        state.lights = with_colours(state, capture, few, patches.vertex)
     state.under = thinned(capture, state.lights)
     of_pixels, their_lights = state.under if task.thinned else (capture, state.lights)
     material = material_of(state, grey_albedo(vertices))

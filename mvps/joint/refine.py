@@ -73,7 +73,6 @@ MOSTLY = 0.6
 """Part of a mesh's edges that creases split, above which the object has more detail than the mesh: halves of these are split once more.
 Four captures lie at 0.38 to 0.46 and 0.69 to 0.74 (docs/findings/vertices.md)."""
 
-
 MOST_REPEATS = 2
 """How often a round is done again whose vertices moved by more than its sweeps reach: what they look for may lie beyond."""
 
@@ -109,16 +108,17 @@ class RoundSettings:
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """rounds: in order; free_lights: solve the lights; final: this is the result, so the components of the reflectance model are chosen by
-    held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too, and the pixels' normals of the
-    last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and normals but not the surface, so
-    the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of two pixels and more, or for
-    Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last round's (detail.py); eased:
-    lights are solved on fewer vertices, and stay, like the pixels' normals, where a round is done again; goes_on: how far earlier rounds'
-    moves did (onward.py); model: all that the reflectance may have."""
+    """rounds: in order; free_lights: solve the lights; free_colours: and their colours; final: this is the result, so the components of the
+    reflectance model are chosen by held-out lights in the first round, and colours are solved; in_full: the lobes' sharpness is solved too,
+    and the pixels' normals of the last round use all lights (thinned.py); for_field: Stage I goes on from here, which wants lights and
+    normals but not the surface, so the last round leaves it; half: normals of every other pixel only (pixels.py), enough where edges are of
+    two pixels and more, or for Stage I, which draws fewer rays than there are pixels; detail: the result's mesh is finer than the last
+    round's (detail.py); eased: lights are solved on fewer vertices, and stay, like the pixels' normals, where a round is done again;
+    goes_on: how far earlier rounds' moves did (onward.py); model: all that the reflectance may have."""
 
     rounds: tuple[RoundSettings, ...]
     free_lights: bool = True
+    free_colours: bool = True
     final: bool = False
     in_full: bool = False
     for_field: bool = False
@@ -229,6 +229,13 @@ def _in_detail(result: Refined, capture: Capture, told: Moved, seen: list[Any]) 
     return replace(result, surface=finer.surface, material=material, unexplained=unexplained, in_light=in_light)
 
 
+def _task(settings: RefineSettings, last: bool, device: torch.device) -> Task:
+    """What a round is to do, the last one or another."""
+    thinned = not (settings.in_full and last)
+    free = settings.free_lights, settings.free_colours
+    return Task(*free, settings.final, settings.in_full, thinned, settings.half, device, settings.eased)
+
+
 def _together(lights: Lights, settings: RefineSettings) -> Together:
     """What the equations of the lights have, which may all be known."""
     unknown = solved_together(lights, unknown_of(lights)) if settings.free_lights else 0
@@ -271,8 +278,7 @@ def refine(
         mesh_normal = vertex_normals(state.surface)
         leaves_surface = (settings.for_field and not pending) or not round_settings.fusions
         if round_settings.photometric:
-            every_light = settings.in_full and not pending
-            task = Task(settings.free_lights, settings.final, settings.in_full, not every_light, settings.half, device, settings.eased)
+            task = _task(settings, not pending, device)
             on_mesh = account[-1] if isinstance(last, Moves) and settings.eased else None
             changes = photometric_round(state, capture, task, carried, generator, on_mesh)
             seen = [s.vertex.cpu().numpy() for s in state.views]
