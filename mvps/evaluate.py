@@ -196,18 +196,13 @@ def protocol_list(text: str) -> tuple[str, ...]:
 
 
 def renew_report(result: Path, truth: Path) -> None:
-    """The result's report.html made again, now with the figures against ground truth. A capture in which something was found is mended
-    again, as it was for the result."""
+    """The result's report.html made again, now with the figures against ground truth."""
     from mvps.export import read_reconstruction
-    from mvps.load import read_capture
-    from mvps.progress import Progress
     from mvps.report import write_report
-    from mvps.sound import sound
+    from mvps.same_object import capture_of
 
-    reconstruction, capture = read_reconstruction(result), read_capture(truth)
-    if reconstruction.metrics.get("findings"):
-        capture, _ = sound(capture, Progress())
-    write_report(reconstruction, capture, result / "report.html")
+    reconstruction = read_reconstruction(result)
+    write_report(reconstruction, capture_of(reconstruction, truth), result / "report.html")
 
 
 def main(argv: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
     mesh.ply                 vertices (world frame, units of the capture), refined normals, albedo as sRGB vertex colour
     model.glb                textured physically based model;  model.obj, .mtl and textures likewise   (where textures are given)
     model_N.glb              the same with N faces;  model_N.obj, .mtl, textures and mesh_N.ply likewise   (for each N that is given)
+    cameras.json             of the views, as they were used (viewpoints.py)   (where cameras are given)
     lights.json              {"one_rig": bool, "fixed": bool, "views": {name: {"lights": [numbers],
                                  "direction": [[x, y, z], ...], "intensity": [[r, g, b], ...]}}}
     material.npz             albedo (V, 3), specular_weight (V, lobes[, 3]), sharpness (lobes,), confidence (V,),
@@ -38,8 +39,9 @@ from mvps.inputs import DAMAGED, JSON_LIMIT, check_npy, check_npz, parsed_json, 
 from mvps.mesh import nearest, normalise
 from mvps.meshfile import PlyMesh, obj_bytes, ply_bytes, read_ply
 from mvps.pbr import reflectance_scale, srgb_bytes
-from mvps.scene import CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
+from mvps.scene import Camera, CaptureError, Float, Lights, Material, Reconstruction, Residual, Surface
 from mvps.texture import Textures, png_bytes
+from mvps.viewpoints import cameras_record
 
 
 def write_reconstruction(
@@ -48,12 +50,13 @@ def write_reconstruction(
     textures: Textures | None = None,
     report: str = "",
     levels: Mapping[int, Textures] = MappingProxyType({}),
+    cameras: Mapping[str, Camera] = MappingProxyType({}),
 ) -> None:
     """Write a result folder, whole or not at all.
 
     An empty folder or an earlier result at the same place is replaced; CaptureError where something else is there. Without
     `textures` (see mvps.texture.bake) the textured models are left out, without a `report` (HTML) report.html is.
-    levels: textures of models with fewer faces, by the numbers in their names.
+    levels: textures of models with fewer faces, by the numbers in their names. cameras: by the views' names, for other programs.
     ValueError where metrics or settings are not plain JSON values.
     """
     files = {
@@ -61,6 +64,8 @@ def write_reconstruction(
         "metrics.json": _json("metrics", reconstruction.metrics),
         "settings.json": _json("settings", reconstruction.settings),
     }
+    if cameras:
+        files["cameras.json"] = _json("cameras", cameras_record(cameras), sort=False)
     with appearing_whole(folder, RESULT_MARKS, CHECKPOINT) as writing:
         files |= _mesh_files(reconstruction)
         if textures is not None:
@@ -146,13 +151,13 @@ def _normal_map(path: Path) -> Any:
 def check_account(metrics: Mapping[str, Any], settings: Mapping[str, Any]) -> None:
     """ValueError where metrics or settings hold other kinds of values than the commands that read them take."""
     model = metrics.get("model") or {}
-    records = [metrics.get("stages") or [], metrics.get("rounds") or [], model.get("components") or []]
+    records = [metrics.get(name) or [] for name in ("stages", "rounds", "findings")] + [model.get("components") or []]
     texts = [metrics.get("status") or {}, metrics.get("held_out") or {}, model]
     truth = metrics.get("truth") or {}
     if not all(isinstance(rows, list) and all(isinstance(row, dict) for row in rows) for rows in records) or not all(
         isinstance(value, dict) for value in texts
     ):
-        raise ValueError("metrics.json: wanted stages, rounds and components as lists of objects, given other values")
+        raise ValueError("metrics.json: wanted stages, rounds, findings and components as lists of objects, given other values")
     if not isinstance(truth, dict) or not all(isinstance(value, int | float) and abs(value) < 1e300 for value in truth.values()):
         raise ValueError("metrics.json: wanted numbers as truth, given other values")
     held = [settings.get(name) or [] for name in ("hold_out_views", "hold_out_lights")]

@@ -5,7 +5,8 @@
 Every layer is the mean over SUBPIXELS rays a pixel, those that miss the surface left out; coverage is the part of them that meet it.
 With many lights each ray takes its share of them, times the number of rays: neighbours of one pixel see nearly the same point, so
 the mean is that under all lights at the price of one ray. Where a ray of a pixel misses, its share would be missing too, so the others
-take all lights; those are the few pixels along an outline.
+take all lights; those are the few pixels along an outline. The layer of shadows is the light that is hidden over that which would arrive,
+each a mean over the rays: shares of the lights are not as strong as each other.
 
 Pixels are worked on a part at a time: memory grows with the picture's own values only.
 """
@@ -106,7 +107,8 @@ def _of_pixels(
     found["depth"] = np.where(points.hit, (points.position @ camera.rotation.T + camera.translation)[:, 2], 0)
     hit = points.hit.reshape(SUBPIXELS, -1)
     lit = {"image", "specular", "shadow"} & set(layers)
-    found |= {name: np.zeros(hit.size if name == "shadow" else (hit.size, 3)) for name in lit}
+    # Hidden light, and what would arrive.
+    found |= {name: np.zeros((hit.size, 2 if name == "shadow" else 3)) for name in lit}
     for rays, share in _groups(hit, len(light.direction)) if lit else ():
         of_rays = _lit(caster, material, camera, points.part(rays), light, share, sent)
         for name in lit:
@@ -121,6 +123,9 @@ def _of_pixels(
     means = {name: mean(found[name]) for name in layers}
     if "normals" in means:
         means["normals"] /= np.maximum(lengths(means["normals"])[:, None], 1e-6).astype(np.float32)
+    if "shadow" in means:
+        hidden, arriving = means["shadow"].T
+        means["shadow"] = hidden / np.maximum(arriving, np.float32(1e-12))
     return means, hit.mean(0, dtype=np.float32)
 
 
@@ -136,9 +141,10 @@ def _groups(hit: Bool, lights: int) -> list[tuple[Int, slice]]:
 def _lit(
     caster: RayCaster, material: Material, camera: Camera, points: Points, light: Illumination, share: slice, sent: Sent
 ) -> dict[str, Float]:
-    """image, specular (n, 3) and shadow (n,) under a share of the lights, which stands for all of them, and all points of light."""
+    """image, specular (n, 3) and shadow (n, 2), hidden light and what would arrive, under a share of the lights, which stands for all of
+    them, and all points of light."""
     n = len(points.position)
-    found: dict[str, Float] = {"image": np.zeros((n, 3)), "specular": np.zeros((n, 3)), "shadow": np.zeros(n)}
+    found: dict[str, Float] = {"image": np.zeros((n, 3)), "specular": np.zeros((n, 3)), "shadow": np.zeros((n, 2))}
     at_a_time = len(range(LIGHTS_AT_A_TIME)[: len(light.direction)][share])
     step = max(1, SAMPLES_PER_CHUNK // max(1, at_a_time, len(light.position)))
     for start in range(0, n, step):
@@ -153,7 +159,7 @@ def _lit_part(
 ) -> dict[str, Float]:
     view = view_directions(camera, points.position)
     image, specular = np.zeros((len(view), 3)), np.zeros((len(view), 3))
-    hidden, arriving = np.zeros(len(view)), np.zeros(len(view))
+    flux = np.zeros((len(view), 2))
     for start in range(0, len(light.direction), LIGHTS_AT_A_TIME):
         some = slice(start, start + LIGHTS_AT_A_TIME)
         direction, intensity, wide = (a[some][share] for a in (light.direction, light.intensity, light.spread))
@@ -164,8 +170,8 @@ def _lit_part(
         image += np.einsum("nlc,nl,lc->nc", shaded(points, view, material, direction, wide), ~shadow, intensity)
         lobes = specular_shading(points.normal, view, direction, points.specular_weight, material.law, wide)
         specular += np.einsum("nlc,nl,lc->nc", np.broadcast_to(lobes, (*shadow.shape, 3)), ~shadow, intensity)
-        flux = np.maximum(points.normal @ direction.T, 0) * intensity.mean(1)
-        hidden, arriving = hidden + (flux * shadow).sum(1), arriving + flux.sum(1)
+        arriving = np.maximum(points.normal @ direction.T, 0) * intensity.mean(1)
+        flux += np.stack([(arriving * shadow).sum(1), arriving.sum(1)], 1)
         image += _sent(sent(start), points, intensity, share)
     if len(light.position):
         image += _sent(sent(-1), points, light.strength)
@@ -177,9 +183,9 @@ def _lit_part(
         image += shaded(points, view, material, towards[:, None])[:, 0] * ~shadow[:, None] * intensity
         lobes_only = points._replace(albedo=np.zeros_like(points.albedo), share=np.zeros_like(points.share))
         specular += shaded(lobes_only, view, material, towards[:, None])[:, 0] * ~shadow[:, None] * intensity
-        flux = np.maximum((points.normal * towards).sum(1), 0) * intensity.mean(1)
-        hidden, arriving = hidden + flux * shadow, arriving + flux
-    return {"image": image, "specular": specular, "shadow": hidden / np.maximum(arriving, 1e-12)}
+        arriving = np.maximum((points.normal * towards).sum(1), 0) * intensity.mean(1)
+        flux += np.stack([arriving * shadow, arriving], 1)
+    return {"image": image, "specular": specular, "shadow": flux}
 
 
 def _sent(arriving: Arriving | None, points: Points, strength: Float, share: slice = slice(None)) -> Float:

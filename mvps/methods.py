@@ -177,7 +177,8 @@ def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
     lights = read_calibrated_lights(path, used) if method.calibrated else None
     made = method.run(capture, replace(settings, calibrated_lights=method.calibrated), lights, progress, findings)
     metrics = {"findings": [asdict(one) for one in findings], **made.metrics, "stages": progress.stages}
-    write_reconstruction(replace(made, metrics=metrics, settings={**made.settings, "method": name}), out)
+    finished = replace(made, metrics=metrics, settings={**made.settings, "method": name})
+    write_reconstruction(finished, out, cameras={view.name: view.camera for view in capture.views})
 
 
 OPTIONS: dict[str, tuple[Callable[[str], Any], Any, str]] = {

@@ -41,6 +41,14 @@ FRAMES_PER_SECOND = 24
 """Of videos: cinema's."""
 
 
+PREMULTIPLIED = ("exr", "png16")
+"""Formats whose light is that of the whole pixel, what the object covers of it times what that part sends: so OpenEXR has it, and so it is
+before black, where nothing tells the rest."""
+
+LIGHT = ("image", "specular")
+"""Layers of light. The others are values, which are those of the part that is covered."""
+
+
 class Range(NamedTuple):
     """Of the values that all pictures of a command show: the factor of radiance, 0 while it is not known; depths that are white and
     black."""
@@ -174,6 +182,8 @@ def as_shown(layer: str, values: Layer, coverage: Layer, shown: Range) -> Layer:
 
 def write_layer(folder: Path, name: str, layer: str, values: Layer, coverage: Layer, shown: Range, form: str) -> None:
     """One file. form: one of mvps.render's formats."""
+    if form in PREMULTIPLIED and layer in LIGHT:
+        values = values * coverage[..., None]
     if form == "exr":
         write_exr(folder / f"{name}.exr", values, coverage)
         return

@@ -190,7 +190,8 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     metrics = {**reconstruction.metrics, "stages": progress.stages}
     finished = replace(reconstruction, metrics=metrics)
     with progress.stage("report and files"):
-        write_reconstruction(finished, out, textures, report_html(finished, capture), dict(zip(shells, levels, strict=True)))
+        smaller, cameras = dict(zip(shells, levels, strict=True)), {view.name: view.camera for view in capture.views}
+        write_reconstruction(finished, out, textures, report_html(finished, capture), smaller, cameras)
 
 
 def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Lights | None, resume: bool) -> Checkpoints:

@@ -126,6 +126,14 @@ def numbers(counts: tuple[int, ...], wanted: str) -> Callable[[str], tuple[float
     return numbers_
 
 
+def direction(text: str) -> tuple[float, ...]:
+    """Three numbers that are not all zero."""
+    found = numbers((3,), "three numbers")(text)
+    if not any(found):
+        raise ArgumentTypeError(f"wanted a direction, given {text!r}")
+    return found
+
+
 def size(text: str) -> tuple[int, int]:
     """Width and height: "800x600"."""
     words = text.lower().split("x")
@@ -187,7 +195,7 @@ def options() -> Any:
     cameras.add_argument("--turntable", type=int, default=SUPPRESS, metavar="FRAMES", help="cameras evenly around the object")
     cameras.add_argument("--elevation", type=finite, default=15.0, metavar="DEG", help="of the turntable's cameras above the horizon")
     cameras.add_argument("--cameras", type=Path, default=SUPPRESS, metavar="FILE", help=CAMERAS_HELP)
-    cameras.add_argument("--up", type=vector, default=(0.0, 0.0, 1.0), metavar="X,Y,Z", help=UP_HELP)
+    cameras.add_argument("--up", type=direction, default=UP, metavar="X,Y,Z", help=UP_HELP)
     cameras.add_argument("--fov", type=angle, default=30.0, metavar="DEG", help="field of view of --camera and --turntable")
     cameras.add_argument("--size", type=size, default=(640, 640), metavar="WxH", help="pixels of --camera and --turntable")
     lights = made.add_argument_group("lights", "together; without any, one from above the camera's right shoulder")
@@ -215,6 +223,7 @@ def options() -> Any:
 
 CAMERAS_HELP = 'JSON: {"cameras": [{"name", "K", "rotation", "translation", "width", "height"}]}, camera_from_world, OpenCV axes'
 POINT_HELP = "place of a point of light, world units; its intensity at the object's middle"
+UP = (0.0, 0.0, 1.0)
 UP_HELP = "upwards in the world, for --camera, --turntable and --envmap"
 EXPOSURE_HELP = "factor of radiance; if left out, highlights of the first picture that shows the object become white"
 FRAME_HELP = "of --light and --point; camera: x right, y up, z towards the camera, fixed to each camera, its origin in the object's middle"

@@ -1,8 +1,11 @@
-"""The capture that a result is shown, rendered or evaluated with: it must be of the same object.
+"""The capture that a result is shown, rendered or evaluated with: it must be of the same object, and as it was reconstructed.
 
     overlap of a view = |S and M| / |S or M|,     S the pixels that see the result's surface, M the view's mask
 
 is 0.99 where they belong together, and 0.34 to 0.48 (median of the views) where one of DiLiGenT-MV's objects stands in another's place.
+
+Where cameras were moved, masks mended or a curve undone before the reconstruction (sound.py), the files still hold what was wrong. The same
+photographs are mended again: a surface fits the cameras that it was made with, and predicts linear photographs.
 """
 
 from __future__ import annotations
@@ -13,11 +16,15 @@ from pathlib import Path
 import numpy as np
 
 from mvps.load import read_capture
+from mvps.progress import Progress
 from mvps.scene import Bool, Camera, Capture, CaptureError, Reconstruction
 from mvps.visibility import RayCaster, camera_hits, ray_caster
 
 LEAST_OVERLAP = 0.5
 """Of the median view: below it the two share less than they differ by."""
+
+CHANGES = ("pose", "mask", "radiometry")
+"""What findings are about that change the photographs that stay."""
 
 PIXELS = 4096
 """Of a view that are looked at: their share is then known to 2 %."""
@@ -29,8 +36,8 @@ def capture_of(
     views: Sequence[int] | None = None,
     lights: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
 ) -> Capture:
-    """The capture at path, views and lights as for `read_capture`. CaptureError where it cannot be read, or shows another object than the
-    result in the views that it shares with it."""
+    """The capture at path, views and lights as for `read_capture`, the result's own views mended as they were for the result. CaptureError
+    where it cannot be read, or shows another object than the result in the views that it shares with it."""
     capture = read_capture(path, views, lights)
     shared = [view for view in capture.views if view.name in result.views]
     if shared:
@@ -41,7 +48,29 @@ def capture_of(
                 f"{path}: wanted photographs of the result's object, given masks that its surface and they share {overlap:.0%} of;"
                 " give the capture that was reconstructed"
             )
-    return capture
+    return _with_mends(result, path, capture) if shared and was_mended(result) else capture
+
+
+def was_mended(result: Reconstruction) -> bool:
+    """Whether a result was made from other cameras, masks or values than its capture's files hold."""
+    return any(one.get("mended") and one.get("about") in CHANGES for one in result.metrics.get("findings") or [])
+
+
+def _with_mends(result: Reconstruction, path: Path, capture: Capture) -> Capture:
+    """The capture, what it shares with the result as it was mended for it. All of its photographs tell that."""
+    from mvps.sound import sound
+
+    whole, used = read_capture(path), dict(zip(result.views, result.light_names, strict=True))
+    there = {view.name: [number for number in view.lights if number in used.get(view.name, ())] for view in whole.views}
+    there = {name: numbers for name, numbers in there.items() if numbers}
+    if not there:
+        return capture
+    mended, _ = sound(whole.select(there), Progress())
+    asked = {view.name: view.lights for view in capture.views}
+    # One photograph is as good as another where they are asked for the camera alone.
+    kept = {view.name: [n for n in view.lights if n in asked.get(view.name, ())] or view.lights[:1] for view in mended.views}
+    again = {view.name: view for view in mended.select(kept).views}
+    return Capture(capture.name, tuple(again.get(view.name, view) for view in capture.views))
 
 
 def overlap_of(caster: RayCaster, camera: Camera, mask: Bool) -> float:

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
 from mvps.command import parse, parser, run
+from mvps.render import UP, direction
 from mvps.scene import CaptureError
 
 if TYPE_CHECKING:
@@ -47,9 +48,11 @@ class Model:
         capture: Capture | None,
         environments: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
         materials: Mapping[str, Material] = MappingProxyType({}),
+        sky: Sequence[float] = UP,
     ) -> None:
         """environments: pictures (height, width, 3) by names, beside those of viewer/environments.py; materials: edited ones by names,
-        beside the solved one and the presets of edits.py; the page starts with the first."""
+        beside the solved one and the presets of edits.py; the page starts with the first. sky (3,): upwards in environments, world frame;
+        the object is turned about the first camera's upwards direction."""
         import numpy as np
 
         from mvps.edits import PRESETS
@@ -61,7 +64,7 @@ class Model:
         self._views = {} if capture is None else {view.name: view for view in capture.views if view.name in result.views}
         self._environments = {name: made(name) for name in MADE} | dict(environments)
         self._materials: dict[str, Material | None] = {**materials, SOLVED: result.material, **dict.fromkeys(PRESETS)}
-        self._towards, self._up = np.array([1.0, 0.0, 0.3]), np.array([0.0, 0.0, 1.0])
+        self._towards, self._up, self._sky = np.array([1.0, 0.0, 0.3]), np.array(UP), np.array(sky)
         if self._views:
             first = next(iter(self._views.values())).camera
             self._towards, self._up = -first.rotation[2], -first.rotation[1]
@@ -73,7 +76,9 @@ class Model:
 
         names = tuple(self._materials)
         first = self._material(names[0])
-        part = viewer_html(self._result.surface, first, self._up, self._towards, True, tuple(self._environments), names)
+        part = viewer_html(
+            self._result.surface, first, self._up, self._towards, True, tuple(self._environments), names, exposed=self._result.material
+        )
         beside = self._photographs()
         body = f'<div class="beside"><div>{part}</div><div>{beside}</div></div>' if beside else part
         head = (
@@ -155,7 +160,7 @@ class Model:
         name, turn = (asked.get("of") or [""])[0], (asked.get("turn") or ["0"])[0]
         if not turn.removeprefix("-").isdecimal() or len(turn) > LONGEST:
             raise CaptureError(f"turn: wanted whole degrees, given {query!r}")
-        light = surroundings(self._environments, name, int(turn), self._up)
+        light = surroundings(self._environments, name, int(turn), self._sky)
         lights = np.column_stack([light.direction, light.intensity, light.spread]).astype("<f4")
         reached = ~self._hidden(light.direction) @ (1 << np.arange(len(lights), dtype=np.uint32))
         return "application/octet-stream", lights.tobytes() + reached.astype("<u4").tobytes()
@@ -176,7 +181,7 @@ class Model:
         from mvps.viewer.picture import asked, picture, surroundings
 
         scene = asked((parse_qs(query).get("scene") or [""])[0])
-        around = surroundings(self._environments, scene.environment, scene.turn, self._up) if scene.environment else Illumination()
+        around = surroundings(self._environments, scene.environment, scene.turn, self._sky) if scene.environment else Illumination()
         surface, material = self._result.surface, self._material(scene.material)
         shown = picture(self._caster, material, light_senders(surface, material), scene, around)
         return "image/png", png_bytes(shown)
@@ -256,6 +261,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument(
         "--envmap", type=Path, action="append", default=[], metavar="FILE", help="an environment to choose, .hdr or .exr; may be repeated"
     )
+    made.add_argument("--up", type=direction, default=UP, metavar="X,Y,Z", help="upwards in environments, world frame")
     made.add_argument("--port", type=int, default=8080, help="of the page's address; 0: any free one")
     made.add_argument("--no-browser", action="store_true", help="print the address only")
     given = parse(made, argv)
@@ -276,7 +282,8 @@ def main(argv: Sequence[str]) -> None:
         name: edited(result.surface, result.material, read_edits(path), cameras)
         for name, path in named(given.edit, [SOLVED, *PRESETS]).items()
     }
-    model = Model(result, capture, {name: read_environment(path) for name, path in named(given.envmap, list(MADE)).items()}, materials)
+    environments = {name: read_environment(path) for name, path in named(given.envmap, list(MADE)).items()}
+    model = Model(result, capture, environments, materials, given.up)
     try:
         serving = server(model, given.port)
     except OSError as error:

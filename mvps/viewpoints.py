@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,17 @@ def read_cameras(path: Path) -> dict[str, Camera]:
     if not cameras or len(cameras) != len(records):
         raise CaptureError(f"{path}: wanted {form}, with different names, given {len(records)} cameras; correct the file")
     return cameras
+
+
+def cameras_record(cameras: Mapping[str, Camera]) -> dict[str, Any]:
+    """What `read_cameras` reads."""
+    return {
+        "cameras": [
+            {"name": name, "K": of.K.tolist(), "rotation": of.rotation.tolist(), "translation": of.translation.tolist()}
+            | {"width": of.width, "height": of.height}
+            for name, of in cameras.items()
+        ]
+    }
 
 
 def _camera(record: dict[str, Any]) -> Camera:

@@ -178,3 +178,26 @@ def test_the_server_s_page_has_exact_shadows_and_photographs(scene: SphereScene,
         traced_over(page)
         serving.shutdown()
     assert not said
+
+
+ROLLED = {"eye": [80.0, 0, 0], "forward": [-1.0, 0, 0], "above": [0.0, 1, 0], "focal": [100.0, 100], "middle": [32.0, 24], "size": [64, 48]}
+"""A camera that holds the world's y upwards, where the page holds its z."""
+
+
+def test_light_follows_the_hand_in_any_photograph(scene: SphereScene, opened: Opened) -> None:
+    """To the right on the screen, however the photograph's camera was rolled."""
+    with server(Model(scene.reconstruction, None), 0) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        page, said = opened(f"http://127.0.0.1:{serving.server_port}/")
+        page.evaluate("document.getElementById('viewer-exact').style.visibility = 'hidden'")
+        page.evaluate("camera => { window.mvpsViewer.look(camera); window.mvpsViewer.lightFrom([1, 0, 0], [1, 1, 1]); }", ROLLED)
+        before = shown(page).mean(-1)
+        page.locator("#viewer").focus()
+        for _ in range(6):
+            page.keyboard.press("Shift+ArrowRight")
+        change = shown(page).mean(-1) - before
+        down, across = np.indices(change.shape)
+        along, aside = ((at - at.mean()) * change for at in (across, down))
+        assert along.sum() > 5 * abs(aside.sum()) > 0
+        serving.shutdown()
+    assert not said

@@ -88,7 +88,13 @@ def test_every_file_of_a_result_is_described(scene: SphereScene, tmp_path: Path)
     layers = ((np.zeros((1, 2), np.float32), np.zeros(1, np.float32)),)
     residual = Residual(np.zeros(vertices, np.float32), np.zeros((vertices, 2), np.float32), layers)
     object.__setattr__(made.material, "residual", residual)
-    write_reconstruction(made, tmp_path / "result", bake(made.surface, made.material, made.lights, scene.capture, 1)[0], "<p>report</p>")
+    write_reconstruction(
+        made,
+        tmp_path / "result",
+        bake(made.surface, made.material, made.lights, scene.capture, 1)[0],
+        "<p>report</p>",
+        cameras={"view_01": scene.capture.views[0].camera},
+    )
     first = made.views[0]
     written = {str(path.relative_to(tmp_path / "result")).replace(first, "view_01") for path in (tmp_path / "result").rglob("*")}
     written = {name for name in written if "/" not in name or "view_01" in name}

@@ -129,7 +129,8 @@ def test_a_point_of_light_falls_off_with_the_square(scene: SphereScene, caster: 
     np.testing.assert_allclose(middle, 1 / 4, rtol=0.01)
 
 
-def test_what_stands_between_throws_a_shadow_and_what_stands_behind_does_not() -> None:
+def lidded() -> tuple[RayCaster, Material, Camera]:
+    """A ground with a lid above its middle, and a camera above both."""
     ground, lid = [[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[-3.0, -3, 4], [3, -3, 4], [3, 3, 4], [-3, 3, 4]]
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     surface = Surface(np.array(ground + lid), np.concatenate([faces, faces + 4]))
@@ -137,11 +138,28 @@ def test_what_stands_between_throws_a_shadow_and_what_stands_behind_does_not() -
     camera = Camera(np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.diag([1.0, -1, -1]), np.array([0.0, 0, 20]), 40, 40)
     caster = RayCaster(surface)
     caster.__dict__["offset"] = 1e-3
+    return caster, plain, camera
+
+
+def test_what_stands_between_throws_a_shadow_and_what_stands_behind_does_not() -> None:
+    caster, plain, camera = lidded()
     shown = []
     for height in (20.0, 2.0):
         light = Illumination(position=np.array([[8.0, 0, height]]), strength=np.full((1, 3), 100.0))
         shown.append(rendered(caster, plain, camera, light, ("shadow",))[0]["shadow"])
     assert shown[0][20, 11] == 1 and shown[1][20, 11] == 0
+
+
+def test_shadow_is_of_all_light_whichever_ray_takes_the_strong_one() -> None:
+    """A sun that the lid hides, which a quarter of the rays take, in a dim sky that nothing hides: of all light the sun's share."""
+    caster, plain, camera = lidded()
+    sky = np.column_stack([np.full(63, -1.0), np.linspace(-0.1, 0.1, 63), np.full(63, 1.0)])
+    direction = np.concatenate([[[8.0, 0, 4]], sky])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    light = Illumination(direction, np.full((64, 3), 0.02) + 5 * np.eye(64, 1))
+    shadow = rendered(caster, plain, camera, light, ("shadow",))[0]["shadow"]
+    arriving = direction[:, 2] * light.intensity[:, 0]
+    assert shadow[20, 8] == pytest.approx(arriving[0] / arriving.sum(), abs=1e-3)
 
 
 def test_layers_are_what_they_say(scene: SphereScene, caster: RayCaster) -> None:

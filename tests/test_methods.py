@@ -6,11 +6,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import mvps.nearness
 import mvps.sound
 from mvps.finding import Finding
+from mvps.load import read_capture
 from mvps.methods import run_method
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, main
@@ -18,6 +20,7 @@ from mvps.scene import Capture
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
+from mvps.viewpoints import read_cameras
 
 WRONG = Finding("mask", "all views", "masks are too small", False)
 
@@ -51,6 +54,14 @@ def test_ours_is_as_doubtful_by_either_command(path: Path, tmp_path: Path, doubt
     one, other = (account(tmp_path / name) for name in ("method", "command"))
     assert one["status"] == other["status"] and one["status"]["name"] == "doubtful"
     assert one["findings"] == other["findings"] and [of["about"] for of in one["findings"]] == ["mask", "lights"]
+    cameras = {view.name: view.camera for view in read_capture(path).views}
+    for name in ("method", "command"):
+        written = read_cameras(tmp_path / name / "cameras.json")
+        assert list(written) == list(cameras)
+        for of in cameras:
+            for part in ("K", "rotation", "translation"):
+                np.testing.assert_array_equal(getattr(written[of], part), getattr(cameras[of], part))
+            assert (written[of].width, written[of].height) == (64, 64)
     said = capsys.readouterr().out
     assert "all views: masks are too small\n" in said and "all views: brightness falls off" in said
 

@@ -16,6 +16,7 @@ import mvps.render
 from mvps.command import run
 from mvps.export import write_reconstruction
 from mvps.load import read_environment
+from mvps.new_pictures import Range, write_layer
 from mvps.render import main, render_view
 from mvps.rendering import RAYS_ACROSS
 from mvps.scene import Camera, CaptureError, Lights, Truth, View
@@ -220,6 +221,20 @@ def test_values_as_they_are(folders: tuple[Path, Path], scene: SphereScene, tmp_
     photographed[view.mask] = view.radiance()[:, 0]
     inner = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5))) > 0
     np.testing.assert_allclose(found[inner].clip(0, 1), photographed[inner].clip(0, 1), atol=0.02)
+
+
+def test_light_of_pixels_that_are_covered_in_part(tmp_path: Path) -> None:
+    """Of the whole pixel, but where PNG has its coverage beside it; values are those of what is covered."""
+    values, coverage = np.full((1, 3, 3), 0.5, np.float32), np.array([[0.0, 0.25, 1.0]], np.float32)
+    for layer, wanted in (("image", 0.5 * coverage[0]), ("albedo", np.full(3, 0.5))):
+        for form in ("exr", "png16", "png"):
+            write_layer(tmp_path, form, layer, values, coverage, Range(1.0, 0.0, 1.0), form)
+        channels = OpenEXR.File(str(tmp_path / "exr.exr")).channels()
+        found = channels["RGB"].pixels if "RGB" in channels else channels["RGBA"].pixels
+        np.testing.assert_allclose(found[0, :, 1], wanted)
+        np.testing.assert_allclose(image(tmp_path / "png16.png")[0, :, 1] / 65535, wanted, atol=1e-4)
+        stored = cv2.imread(str(tmp_path / "png.png"), cv2.IMREAD_UNCHANGED)
+        assert stored is not None and set(stored[0, :, 1].tolist()) == {188}
 
 
 def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp_path: Path) -> None:

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
+import mvps.sound
 from mvps import evaluate, render, view
 from mvps.command import run
 from mvps.export import read_reconstruction, write_reconstruction
+from mvps.finding import Finding
 from mvps.load import read_capture, read_truth
+from mvps.progress import Progress
 from mvps.same_object import LEAST_OVERLAP, capture_of, overlap_of
-from mvps.scene import Surface, Truth
+from mvps.scene import Capture, Surface, Truth
 from mvps.synthetic.files import write_capture
 from mvps.visibility import camera_hits, ray_caster
 
@@ -103,3 +106,42 @@ def test_views_that_the_result_has_not_are_not_asked(folders: tuple[Path, Path, 
         lights=replace(result.lights, direction=result.lights.direction[:1], intensity=result.lights.intensity[:1]),
     )
     assert len(capture_of(of_one, capture, [2, 3], [1]).views) == 2
+
+
+MOVED = {"about": "pose", "where": "all views", "text": "cameras were moved", "mended": True}
+
+
+@pytest.mark.parametrize(
+    ("found", "mends"),
+    [([MOVED], True), ([MOVED | {"mended": False}], False), ([MOVED | {"about": "photograph"}], False), ([], False)],
+)
+def test_a_capture_is_mended_as_it_was_for_the_result(
+    folders: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch, found: list[dict[str, object]], mends: bool
+) -> None:
+    """Told by all photographs of the result, whatever is asked for; what the result has not is taken as it is."""
+    result = read_reconstruction(folders[1])
+    numbers, lights = (result.light_names[0], result.light_names[1][:3]), result.lights
+    part = replace(
+        result,
+        views=result.views[:2],
+        light_names=numbers,
+        normal_maps=result.normal_maps[:2],
+        lights=replace(
+            lights, **{name: (of[0], of[1][:3]) for name, of in (("direction", lights.direction), ("intensity", lights.intensity))}
+        ),
+        metrics={"findings": found},
+    )
+    told = []
+
+    def moved(capture: Capture, _: Progress) -> tuple[Capture, list[Finding]]:
+        told.append({view.name: view.lights for view in capture.views})
+        views = [replace(view, camera=replace(view.camera, translation=view.camera.translation + 1)) for view in capture.views]
+        return Capture(capture.name, tuple(views)), []
+
+    monkeypatch.setattr(mvps.sound, "sound", moved)
+    given, made = read_capture(folders[0], [1, 2, 3], [2, 5]), capture_of(part, folders[0], [1, 2, 3], [2, 5])
+    assert told == ([dict(zip(part.views, numbers, strict=True))] if mends else [])
+    pairs = zip(made.views, given.views, strict=True)
+    by = [float((after.camera.translation - before.camera.translation).mean()) for after, before in pairs]
+    assert by == pytest.approx([1, 1, 0] if mends else [0, 0, 0])
+    assert [view.lights for view in made.views] == [(2, 5), (2,) if mends else (2, 5), (2, 5)]

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from mvps.mesh import LEAST_FACES, decimated, nearest, normalise
 from mvps.scene import Float, Material, Surface
+from mvps.shading import returned
 from mvps.visibility import Hits, interpolate
 
 MOST_LOBES = 4
@@ -90,6 +91,13 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
         "microfacet": material.microfacet,
     }
     return about, zlib.compress(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), 6)
+
+
+def brightest(material: Material) -> float:
+    """What the brightest places return of light from everywhere, over a white diffuse surface; 1 where nothing returns any."""
+    weight = material.specular_weight if material.specular_weight.ndim == 3 else material.specular_weight[..., None]
+    total = material.albedo + np.einsum("vkc,k->vc", weight, returned(tuple(material.sharpness), material.microfacet)[1:])
+    return float(np.quantile(total, 0.999)) or 1.0
 
 
 def carried_over(surface: Surface, material: Material, points: Float) -> Material:
@@ -153,10 +161,12 @@ def viewer_html(
     environments: Sequence[str] = (),
     materials: Sequence[str] = (),
     room: int | None = None,
+    exposed: Material | None = None,
 ) -> str:
     """The part of a page; up, looking_from (3,): upwards and towards the first camera, world frame. served: visibility is asked of the
     server that the page came from, and environments and other materials, by their names; the first of these is `material`. room: bytes
-    that the part may take, any number if None; a model that needs more is shown with fewer faces, and a line says so."""
+    that the part may take, any number if None; a model that needs more is shown with fewer faces, and a line says so. exposed: the material
+    for which pictures are exposed, `material` if None."""
     # Base64 has four letters for three bytes.
     most = None if room is None else (room - AROUND_BYTES - len(program().encode())) * 3 // 4
     model = packed(surface, material) if most is None else packed_within(surface, material, most)
@@ -164,6 +174,7 @@ def viewer_html(
         return f"<p>The model of {len(surface.faces):,} faces is too large for this page; model.glb shows it.</p>"
     about, data = model
     about |= {"up": np.asarray(up).tolist(), "from": np.asarray(looking_from).tolist(), "served": served}
+    about["exposed"] = brightest(exposed or material)
     fewer = ""
     if about["faces"] < len(surface.faces):
         fewer = f"<p>The page has room for {about['faces']:,} of the model's {len(surface.faces):,} faces; model.glb shows all of them.</p>"

@@ -192,9 +192,8 @@
       middle: half.map((h, i) => h + scale * (camera.middle[i] - camera.size[i] / 2)),
     };
   };
-  // Of the material that the page came with, so that a darker one looks darker.
-  const white = about.white;
-  const exposure = () => 2 ** Number(byId("viewer-exposure").value) / white / 1.5;
+  // Of one material, so that a darker one looks darker.
+  const exposure = () => 2 ** Number(byId("viewer-exposure").value) / about.exposed / 1.5;
   const common = (program, view) => {
     gl.useProgram(program);
     set(program, "low", "3fv", about.low);
@@ -369,9 +368,9 @@
   };
   const move = (x, y, ofLight) => {
     if (!ofLight) leave();
-    const right = unit(cross(up, from));
     if (ofLight) {
-      const above = cross(from, right);
+      // Of the picture: a photograph's camera may be rolled.
+      const right = unit(camera ? cross(camera.forward, camera.above) : cross(up, from)), above = cross(from, right);
       lights[chosen].direction = unit(turned(turned(lights[chosen].direction, above, x), right, y));
       ask(chosen).catch(failed);
     } else {
