@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from argparse import SUPPRESS, ArgumentTypeError
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -145,7 +146,9 @@ def read_views(path: Path, reconstruction: Reconstruction, truth: Truth) -> Capt
         if view in numbers:
             numbers[view].append(number)
     first = {view: used[0] for view, used in zip(reconstruction.views, reconstruction.light_names, strict=True) if used}
-    return capture_of(reconstruction, path, lights={view: kept or [first.get(view, 1)] for view, kept in numbers.items()})
+    lights = {view: kept or [first.get(view, 1)] for view, kept in numbers.items()}
+    # Views of the calibration that are not there were not reconstructed from either.
+    return capture_of(reconstruction, path, [int(view[5:]) for view in truth.views], lights)
 
 
 def write_json(path: Path, value: object) -> None:
@@ -161,6 +164,7 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
     from mvps.export import read_reconstruction
     from mvps.load import read_truth
     from mvps.measures import figures_of, perceptual_distance
+    from mvps.same_object import was_mended
     from mvps.scene import CaptureError
 
     perceptual = perceptual_distance(lpips_weights) if lpips_weights is not None else None
@@ -171,6 +175,8 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
             " give a capture that has some"
         )
     capture = read_views(truth, reconstruction, true_values)
+    if was_mended(reconstruction):
+        true_values = read_truth(truth, {view.name: view.camera for view in capture.views})
     errors: dict[str, float] = {}
     for protocol in protocols:
         errors |= figures_of(protocol, reconstruction, capture, true_values, support_height(capture, true_values), perceptual)
@@ -195,14 +201,13 @@ def protocol_list(text: str) -> tuple[str, ...]:
     return names
 
 
-def renew_report(result: Path, truth: Path) -> None:
-    """The result's report.html made again, now with the figures against ground truth."""
+def reported(result: Path, truth: Path) -> tuple[Reconstruction, Capture]:
+    """What the result's report is made of. CaptureError where it cannot be read."""
     from mvps.export import read_reconstruction
-    from mvps.report import write_report
-    from mvps.same_object import capture_of
+    from mvps.same_object import capture_of, photographs_in
 
     reconstruction = read_reconstruction(result)
-    write_report(reconstruction, capture_of(reconstruction, truth), result / "report.html")
+    return reconstruction, capture_of(reconstruction, truth, *photographs_in(reconstruction, truth))
 
 
 def main(argv: Sequence[str]) -> None:
@@ -235,11 +240,13 @@ def main(argv: Sequence[str]) -> None:
     if "lpips_weights" in options and "psnerf" not in options.protocols:
         made.error(f"--lpips-weights: wanted psnerf among --protocols, given {','.join(options.protocols)}")
     errors = evaluate_result(options.result, options.truth, options.protocols, vars(options).get("lpips_weights"))
-    metrics_file = options.result / "metrics.json"
-    metrics = json.loads(metrics_file.read_text(encoding="utf-8"))
+    from mvps.report import write_report
+
+    reconstruction, capture = reported(options.result, options.truth)
     # What other protocols found stays.
-    write_json(metrics_file, metrics | {"truth": (metrics.get("truth") or {}) | errors})
-    renew_report(options.result, options.truth)
+    metrics = reconstruction.metrics | {"truth": (reconstruction.metrics.get("truth") or {}) | errors}
+    write_json(options.result / "metrics.json", metrics)
+    write_report(replace(reconstruction, metrics=metrics), capture, options.result / "report.html")
     if "json" in options:
         write_json(options.json, errors)
     print(table(errors, options.protocols))

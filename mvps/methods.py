@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from mvps.plan import Parts
 
 Run = Callable[[Capture, Settings, Lights | None, Progress, Sequence[Finding]], Reconstruction]
-"""From a capture (held-out photographs included), settings, calibrated lights of the photographs used, if they were asked for, and what was
-found in the capture, of which our own account tells more."""
+"""From a capture, held-out photographs included, settings, calibrated lights of all of it, if they were asked for, and what was found in
+it, of which our own account tells more."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +107,16 @@ def _pj16(capture: Capture, settings: Settings, lights: Lights | None, progress:
 
 def _lz20(capture: Capture, settings: Settings, lights: Lights | None, progress: Progress, findings: Sequence[Finding]) -> Reconstruction:
     from mvps.baselines.lz20 import lz20
+    from mvps.outcome import lights_in
 
     assert lights is not None
     used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    return _whole(lz20(used, lights, progress), capture, settings)
+    return _whole(lz20(used, lights_in(lights, capture, used), progress), capture, settings, lights)
 
 
-def _whole(made: Reconstruction, capture: Capture, settings: Settings) -> Reconstruction:
-    """The result for all views and lights, made of those that are not held out: lights of the others as ours have them, the mesh's normals
-    in the other views."""
+def _whole(made: Reconstruction, capture: Capture, settings: Settings, given: Lights | None = None) -> Reconstruction:
+    """The result for all views and lights, made of those that are not held out: lights of the others as ours have them, those `given` or
+    not, the mesh's normals in the other views."""
     import numpy as np
 
     from mvps.device import chosen_device
@@ -124,7 +125,8 @@ def _whole(made: Reconstruction, capture: Capture, settings: Settings) -> Recons
     from mvps.visibility import ray_caster
 
     used, held = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    lights = all_lights(capture, used, held, made.lights, made.surface, made.material, chosen_device(settings.device))
+    device = chosen_device(settings.device)
+    lights = all_lights(capture, used, held, made.lights, made.surface, made.material, device, given)
     maps, caster = dict(zip(made.views, made.normal_maps, strict=True)), ray_caster(made.surface)
     names = tuple(view.name for view in capture.views)
     pictures = tuple(maps[v.name] if v.name in maps else mesh_normals(caster, v).astype(np.float32) for v in capture.views)
@@ -172,9 +174,10 @@ def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
     method, progress = METHODS[name], Progress()
     with progress.stage("load"):
         capture = read_capture(path, settings.views or None, settings.lights or None)
-    capture, findings = sound(capture, progress)
-    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    lights = read_calibrated_lights(path, used) if method.calibrated else None
+    parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    lights = read_calibrated_lights(path, capture) if method.calibrated else None
+    capture, findings = sound(capture, progress, settings.hold_out_views, lights is None or lights.one_rig)
+    lights = lights and read_calibrated_lights(path, capture)
     made = method.run(capture, replace(settings, calibrated_lights=method.calibrated), lights, progress, findings)
     metrics = {"findings": [asdict(one) for one in findings], **made.metrics, "stages": progress.stages}
     finished = replace(made, metrics=metrics, settings={**made.settings, "method": name})

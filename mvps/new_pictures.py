@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from argparse import Namespace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +29,7 @@ from mvps.pbr import srgb_bytes, white_level
 from mvps.progress import Progress
 from mvps.render import LARGEST
 from mvps.rendering import light_senders
-from mvps.same_object import capture_of
+from mvps.same_object import capture_of, photographs_in
 from mvps.scene import Camera, CaptureError, Float, Material, Reconstruction
 from mvps.texture import png_bytes
 from mvps.viewpoints import ball_around, look_at, read_cameras, turntable
@@ -67,7 +68,7 @@ def write_pictures(given: Namespace) -> None:
         raise CaptureError(f"--video: wanted cameras of one size, given {' and '.join([*sizes][:2])}; leave --video out")
     material = result.material
     if "edit" in given:
-        seen_from = {v.name: v.camera for v in capture_of(result, given.capture, lights=[1]).views} if "capture" in given else cameras
+        seen_from = views_of(result, given.capture) if "capture" in given else cameras
         material = edited(result.surface, material, read_edits(given.edit), seen_from)
     environment = None
     if "envmap" in given:
@@ -143,13 +144,18 @@ def chosen_cameras(given: Namespace, result: Reconstruction) -> dict[str, Camera
         target = np.array(given.target) if "target" in given else centre
         return {"camera": look_at(np.array(given.camera), target, np.array(given.up), width, height, given.fov)}
     if "capture" in given and "turntable" not in given:
-        views = capture_of(result, given.capture, given.views if "views" in given else None, [1]).views
-        return {view.name: view.camera for view in views}
+        return views_of(result, given.capture, given.views if "views" in given else None)
     frames = given.turntable if "turntable" in given else 1
     if not 1 <= frames <= 9999:
         raise CaptureError(f"--turntable: wanted 1 to 9999 frames, given {frames}")
     around = turntable(result.surface, frames, given.elevation, np.array(given.up), width, height, given.fov)
     return {f"turn_{k:04d}": camera for k, camera in enumerate(around, 1)}
+
+
+def views_of(result: Reconstruction, capture: Path, views: Sequence[int] | None = None) -> dict[str, Camera]:
+    """Cameras of a capture's views, by names: of those with these numbers, or of the result's."""
+    own = photographs_in(result, capture)[0]
+    return {view.name: view.camera for view in capture_of(result, capture, views or own, [1]).views}
 
 
 def chosen_light(given: Namespace, camera: Camera, environment: Illumination | None, centre: Float) -> Illumination:

@@ -275,9 +275,9 @@ def reconstruct_view(
     progress: Progress,
     findings: Sequence[Finding],
 ) -> Reconstruction:
-    """A reconstruction from the only view of `used`; the rest as in reconstruct.reconstruct."""
+    """A reconstruction from the only view of `used`; the rest as in reconstruct.reconstruct. given: lights of all of `capture`."""
     from mvps.device import chosen_device
-    from mvps.outcome import all_lights, normal_pictures, told
+    from mvps.outcome import all_lights, lights_in, normal_pictures, told
     from mvps.relief.ambiguity import FAR_DEG, away_deg, lights_under
     from mvps.relief.silhouette import inflated_normals
 
@@ -285,7 +285,8 @@ def reconstruct_view(
     rough = inflated_normals(view.mask)
     under = lights_under(view, rough)
     with progress.stage("lights") as stage:
-        lights, found = (given, None) if given is not None else first_lights(used, rough, under, settings.seed)
+        own = given and lights_in(given, capture, used)
+        lights, found = (own, None) if own is not None else first_lights(used, rough, under, settings.seed)
         stage.status("given with the capture" if given is not None else words_of(found))
     refined, part, misfits = refined_from(used, lights, found, given is None, rough, settings, parts, progress)
     away = 0.0 if found is None else away_deg(refined.lights.direction[0] @ view.camera.rotation.T, under)
@@ -295,7 +296,7 @@ def reconstruct_view(
             stage.status(f"rounds turned them {away:.0f} deg from what the silhouette tells: from its normals")
         refined, part, misfits = refined_from(used, lights, found, True, rough, settings, parts, progress)
     with progress.stage("lights and normals of all views"):
-        complete = all_lights(capture, part, held, refined.lights, refined.surface, refined.material, device)
+        complete = all_lights(capture, part, held, refined.lights, refined.surface, refined.material, device, given)
         pictures = normal_pictures(capture, part, refined)
     said = WORDS.format(distance=distance_of(view)[1]) + (UNTOLD if given is None and found is None else "")
     return told(capture, part, asdict(settings), refined, complete, pictures, refined.rounds, progress, [*findings, *misfits], said)

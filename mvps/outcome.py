@@ -17,12 +17,39 @@ if TYPE_CHECKING:
     from mvps.scene import Material, Surface
 
 
+def lights_of(lights: Lights, names: Sequence[str], numbers: Sequence[Sequence[int]], part: Capture) -> Lights:
+    """The lights of just the photographs of `part`, from those of the views `names`, which have these numbers."""
+    directions, intensities = [], []
+    for view in part.views:
+        at = names.index(view.name)
+        rows = [numbers[at].index(n) for n in view.lights]
+        directions.append(lights.direction[at][rows])
+        intensities.append(lights.intensity[at][rows])
+    return replace(lights, direction=tuple(directions), intensity=tuple(intensities))
+
+
+def lights_in(lights: Lights, capture: Capture, part: Capture) -> Lights:
+    """The lights of a part of a capture, from those of all of it."""
+    return lights_of(lights, [view.name for view in capture.views], [view.lights for view in capture.views], part)
+
+
 def all_lights(
-    capture: Capture, used: Capture, held: Capture | None, lights: Lights, surface: Surface, material: Material, device: Device
+    capture: Capture,
+    used: Capture,
+    held: Capture | None,
+    lights: Lights,
+    surface: Surface,
+    material: Material,
+    device: Device,
+    given: Lights | None = None,
 ) -> Lights:
-    """Lights of every photograph of `capture`, in its order: `lights` where used, else carried over from the rig or fitted."""
+    """Lights of every photograph of `capture`, in its order: `lights` where used, else carried over from the rig or fitted; where lights
+    were `given`, of all of `capture`, these, as strong as those that were used came out."""
     import numpy as np
 
+    if given is not None:
+        came, went = (np.concatenate(of.intensity).mean() for of in (lights, lights_in(given, capture, used)))
+        return replace(given, intensity=tuple(of_view * (came / went) for of_view in given.intensity))
     from mvps.joint.held_out import carried_over, fit_lights
     from mvps.joint.strengths import strengths_of
 

@@ -19,7 +19,7 @@ from mvps.command import lights_argument, number_list, parse, parser, positive, 
 from mvps.finding import Finding
 from mvps.inputs import shown
 from mvps.memory import keep_below
-from mvps.outcome import all_lights, normal_pictures, told, versions
+from mvps.outcome import all_lights, lights_in, lights_of, normal_pictures, told, versions
 from mvps.progress import Progress, peak_memory_mb
 from mvps.scene import Capture, CaptureError, Law, Lights, NormalMap, Reconstruction
 
@@ -108,7 +108,7 @@ def reconstruct(
     checkpoints: Checkpoints | None = None,
     findings: Sequence[Finding] = (),
 ) -> Reconstruction:
-    """The whole way, values in, values out. lights: calibrated ones of all photographs used, or None to solve them. parts: all if None.
+    """The whole way, values in, values out. lights: calibrated ones of all photographs, or None to solve them. parts: all if None.
     checkpoints: of long stages, kept and gone on from; none if None. findings: of the capture's checks, for the account."""
     from mvps.coarse import coarse, eased
     from mvps.cores import blas_as_asked
@@ -129,6 +129,7 @@ def reconstruct(
 
         return reconstruct_view(capture, used, held, settings, lights, parts, progress, findings)
     length = own_length([view.camera for view in used.views])
+    given = lights and lights_in(lights, capture, used)
     capture, used = in_lengths(capture, length), in_lengths(used, length)
     held = held and in_lengths(held, length)
     rest = without_thin_parts(used, progress)
@@ -138,22 +139,23 @@ def reconstruct(
 
     rounds: list[dict[str, float]] = []
     if settings.preset == "draft":
-        refined = drafted(rest, settings, lights, parts, progress, step)
+        refined = drafted(rest, settings, given, parts, progress, step)
     else:
-        start, rounds = coarse(rest, settings, lights, parts, progress, step)
+        start, rounds = coarse(rest, settings, given, parts, progress, step)
         # Where the model fits badly, ever finer meshes follow biased normals, and lights would follow the mesh: they stay with Stage I's.
         fits, less = start.rounds[-1]["residual"] <= POOR_FIT, eased(settings.preset, rest, start.rounds)
         far = few_lights(rest) or halvings(rest) > 0
         start = replace(start, maps=()) if halvings(rest) else start
-        plan, name = parts.of(last_pass(settings.preset, lights is None, far, rounds, less)), "joint refinement"
+        plan, name = parts.of(last_pass(settings.preset, given is None, far, rounds, less)), "joint refinement"
         plan = replace(plan, free_lights=plan.free_lights and fits)
         refined = step(name, lambda: stage_two(name, rest, start.surface, start, plan, settings, progress, start.carried))
-        if lights is None and not fits and start.status != "converged":
+        if given is None and not fits and start.status != "converged":
             # Lights that stay where they still turned have not settled.
             refined = replace(refined, status=start.status, text=start.text)
     refined, lacking = with_thin_parts(refined, rest, used)
     with progress.stage("lights and normals of all views"):
-        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, chosen_device(settings.device))
+        device = chosen_device(settings.device)
+        complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device, lights)
         pictures = normal_pictures(capture, used, refined)
     result = told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, [*findings, *lacking])
     return in_world_units(result, length)
@@ -172,7 +174,8 @@ def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, 
     with progress.stage("textures") as stage:
         # A texel is seen by several views: their kept lights together determine its albedo several times over.
         fewer_lights = settings.preset == "draft" or (settings.preset == "standard" and abundant(used))
-        part, lights = thinned(used, lights_of(reconstruction, used), FEWER_LIGHTS if fewer_lights else 1)
+        lights = lights_of(reconstruction.lights, reconstruction.views, reconstruction.light_names, used)
+        part, lights = thinned(used, lights, FEWER_LIGHTS if fewer_lights else 1)
         density = TEXELS_PER_PIXEL[settings.preset]
         surface = reconstruction.surface
         fewer = [faces for faces in settings.faces if faces < len(surface.faces)]
@@ -207,17 +210,6 @@ def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Ligh
     run = {"settings": asdict(settings), "versions": versions(), "program": program(), "capture": fingerprint(capture, lights)}
     kinds = (Refined, Surface, Material, Residual, Lights, NormalMap, Law, Trial, Vertices)
     return Checkpoints(out / CHECKPOINT, run, kinds, chosen_device(settings.device), resume)
-
-
-def lights_of(reconstruction: Reconstruction, capture: Capture) -> Lights:
-    """The reconstruction's lights for just the photographs of `capture`."""
-    directions, intensities = [], []
-    for view in capture.views:
-        at = reconstruction.views.index(view.name)
-        rows = [reconstruction.light_names[at].index(n) for n in view.lights]
-        directions.append(reconstruction.lights.direction[at][rows])
-        intensities.append(reconstruction.lights.intensity[at][rows])
-    return replace(reconstruction.lights, direction=tuple(directions), intensity=tuple(intensities))
 
 
 def load_libraries() -> None:
@@ -290,9 +282,12 @@ def main(argv: Sequence[str]) -> None:
             libraries.join()
     from mvps.sound import sound
 
-    capture, findings = sound(capture, progress)
-    used, _ = parted(capture, settings.hold_out_views, settings.hold_out_lights)
-    lights = read_calibrated_lights(given.capture, used) if given.calibrated_lights else None
+    # Says what is wrong with numbers before anything is looked at.
+    parted(capture, settings.hold_out_views, settings.hold_out_lights)
+    lights = read_calibrated_lights(given.capture, capture) if given.calibrated_lights else None
+    capture, findings = sound(capture, progress, settings.hold_out_views, lights is None or lights.one_rig)
+    # Once more, for they turn with cameras that were moved.
+    lights = lights and read_calibrated_lights(given.capture, capture)
     kept = checkpoints_of(given.out, capture, settings, lights, given.resume)
     reconstruction = reconstruct(capture, settings, lights, progress, checkpoints=kept, findings=findings)
     write(reconstruction, capture, settings, given.out, progress)

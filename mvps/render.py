@@ -81,21 +81,22 @@ def render_views(
     from mvps.folders import appearing_whole
     from mvps.progress import Progress
     from mvps.rendering import light_senders
-    from mvps.same_object import capture_of
+    from mvps.same_object import capture_of, photographs_in
     from mvps.scene import CaptureError
     from mvps.texture import png_bytes
     from mvps.visibility import ray_caster
 
     reconstruction = read_reconstruction(result)
     # Only the cameras are needed; one photograph of each view is the least that a capture can be read with.
-    found = capture_of(reconstruction, capture, views, [1]).views
+    own = photographs_in(reconstruction, capture)[0]
+    found = capture_of(reconstruction, capture, views or own, [1]).views
     chosen = [view for view in found if views is not None or view.name in reconstruction.views]
     if not chosen:
         raise CaptureError(
             f"{capture}: wanted the capture of the result's {', '.join(reconstruction.views)}, given one without these views"
         )
     if edit is not None:
-        cameras = {view.name: view.camera for view in capture_of(reconstruction, capture, lights=[1]).views}
+        cameras = {view.name: view.camera for view in capture_of(reconstruction, capture, own, [1]).views}
         material = edited(reconstruction.surface, reconstruction.material, read_edits(edit), cameras)
         reconstruction = replace(reconstruction, material=material)
     caster = ray_caster(reconstruction.surface)

@@ -23,8 +23,8 @@ from mvps.visibility import RayCaster, camera_hits, ray_caster
 LEAST_OVERLAP = 0.5
 """Of the median view: below it the two share less than they differ by."""
 
-CHANGES = ("pose", "mask", "radiometry")
-"""What findings are about that change the photographs that stay."""
+CHANGES = ("photograph", "pose", "mask", "radiometry")
+"""What findings are about that change photographs; two of a view may have changed places."""
 
 PIXELS = 4096
 """Of a view that are looked at: their share is then known to 2 %."""
@@ -36,9 +36,9 @@ def capture_of(
     views: Sequence[int] | None = None,
     lights: Sequence[int] | Mapping[str, Sequence[int]] | None = None,
 ) -> Capture:
-    """The capture at path, views and lights as for `read_capture`, the result's own views mended as they were for the result. CaptureError
-    where it cannot be read, or shows another object than the result in the views that it shares with it."""
-    capture = read_capture(path, views, lights)
+    """The capture at path, views and lights as for `read_capture`, all where there are none, the result's own views mended as they were for
+    the result. CaptureError where it cannot be read, or shows another object than the result in the views that it shares with it."""
+    capture = read_capture(path, views or None, lights or None)
     shared = [view for view in capture.views if view.name in result.views]
     if shared:
         caster = ray_caster(result.surface)
@@ -51,6 +51,13 @@ def capture_of(
     return _with_mends(result, path, capture) if shared and was_mended(result) else capture
 
 
+def photographs_in(result: Reconstruction, path: Path) -> tuple[list[int], dict[str, tuple[int, ...]]]:
+    """Numbers of the views of a result that a capture's folder has, and by their names those of its photographs: of all that `capture_of`
+    may read what is needed to show the result."""
+    there = {name: numbers for name, numbers in zip(result.views, result.light_names, strict=True) if (path / name).is_dir()}
+    return [int(name[5:]) for name in there], there
+
+
 def was_mended(result: Reconstruction) -> bool:
     """Whether a result was made from other cameras, masks or values than its capture's files hold."""
     return any(one.get("mended") and one.get("about") in CHANGES for one in result.metrics.get("findings") or [])
@@ -60,12 +67,9 @@ def _with_mends(result: Reconstruction, path: Path, capture: Capture) -> Capture
     """The capture, what it shares with the result as it was mended for it. All of its photographs tell that."""
     from mvps.sound import sound
 
-    whole, used = read_capture(path), dict(zip(result.views, result.light_names, strict=True))
-    there = {view.name: [number for number in view.lights if number in used.get(view.name, ())] for view in whole.views}
-    there = {name: numbers for name, numbers in there.items() if numbers}
-    if not there:
-        return capture
-    mended, _ = sound(whole.select(there), Progress())
+    settings, photographs = result.settings, read_capture(path, *photographs_in(result, path))
+    one_rig = result.lights.one_rig or not settings.get("calibrated_lights")
+    mended, _ = sound(photographs, Progress(), settings.get("hold_out_views") or (), one_rig)
     asked = {view.name: view.lights for view in capture.views}
     # One photograph is as good as another where they are asked for the camera alone.
     kept = {view.name: [n for n in view.lights if n in asked.get(view.name, ())] or view.lights[:1] for view in mended.views}

@@ -113,7 +113,8 @@ class Model:
                 "size": [camera.width, camera.height],
             }
             for number in view.lights:
-                if number not in result.light_names[place]:
+                # What was left out is no data.
+                if number not in result.light_names[place] or not view.shown[view.lights.index(number)]:
                     continue
                 row = result.light_names[place].index(number)
                 light = (*result.lights.direction[place][row], *result.lights.intensity[place][row])
@@ -272,11 +273,11 @@ def main(argv: Sequence[str]) -> None:
     from mvps.edits import PRESETS, edited, read_edits
     from mvps.export import read_reconstruction
     from mvps.load import read_environment
-    from mvps.same_object import capture_of
+    from mvps.same_object import capture_of, photographs_in
     from mvps.viewer.environments import MADE
 
     result = read_reconstruction(given.result)
-    capture = capture_of(result, given.capture) if "capture" in given else None
+    capture = capture_of(result, given.capture, *photographs_in(result, given.capture)) if "capture" in given else None
     cameras = {} if capture is None else {view.name: view.camera for view in capture.views}
     materials = {
         name: edited(result.surface, result.material, read_edits(path), cameras)

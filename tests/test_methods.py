@@ -14,7 +14,6 @@ import mvps.sound
 from mvps.finding import Finding
 from mvps.load import read_capture
 from mvps.methods import run_method
-from mvps.progress import Progress
 from mvps.reconstruct import Settings, main
 from mvps.scene import Capture
 from mvps.synthetic.files import write_capture
@@ -36,7 +35,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def doubted(monkeypatch: pytest.MonkeyPatch) -> None:
     """A check that finds what it cannot mend, and brightness that falls off as under near lights, which is seen in the result alone."""
 
-    def found(capture: Capture, progress: Progress) -> tuple[Capture, list[Finding]]:
+    def found(capture: Capture, *_: object) -> tuple[Capture, list[Finding]]:
         return capture, [WRONG]
 
     monkeypatch.setattr(mvps.sound, "sound", found)

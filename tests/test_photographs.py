@@ -141,3 +141,18 @@ def test_a_smooth_object_under_another_light_is_no_other_object(foreign: float, 
     capture = Capture("ball", tuple(replace(smooth_ball(rng, k == VIEW), name=f"view_{k}") for k in range(6)))
     told = [one.where for one in photographs(capture)[1] if "another object" in one.text]
     assert told == ([f"view_{VIEW}/{LIGHT + 1:03d}"] if foreign == 0 else [])
+
+
+@pytest.mark.parametrize(("one", "other"), [(3, 7), (5, 8), (2, 12)])
+def test_photographs_under_a_weak_and_a_strong_lamp_change_places(clean: Capture, one: int, other: int) -> None:
+    """Each in the units of the lamp that it was taken under, which are three times the other's."""
+    bright = np.where(np.arange(16) % 2 == one % 2, 1.0, 1 / 3)[:, None]
+    capture = Capture(clean.name, tuple(replace(view, samples=np.rint(view.samples * bright).astype(np.uint16)) for view in clean.views))
+
+    def exchanged(samples: Samples, _: View) -> None:
+        samples[:, [one, other]] = samples[:, [other, one]]
+
+    after, found = photographs(spoilt(capture, exchanged))
+    assert len(found) == 2 and all("put in its place" in of.text for of in found)
+    for view, wanted in zip(after.views, capture.views, strict=True):
+        np.testing.assert_array_equal(view.samples, wanted.samples)

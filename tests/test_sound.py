@@ -14,6 +14,8 @@ from mvps.finding import Finding
 from mvps.progress import Progress
 from mvps.scene import Capture, CaptureError
 from mvps.sound import sound
+from mvps.synthetic.scene import render_capture
+from mvps.synthetic.settings import SceneSettings
 
 
 def test_each_check_gets_what_those_before_it_made(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,3 +68,46 @@ def test_an_object_of_a_few_pixels_is_refused() -> None:
     mask[tuple(few.T)] = True
     with pytest.raises(CaptureError, match=r"view_01/mask.png: wanted an object of 64 pixels and more, given 63"):
         contents(Capture("c", (replace(view, mask=mask, samples=view.samples[:63]),)))
+
+
+@pytest.fixture(scope="module")
+def made() -> Capture:
+    return render_capture(SceneSettings(views=6, lights=8, size=72))[0]
+
+
+def shifted(capture: Capture, at: int, rows: int, columns: int) -> Capture:
+    """The pictures of one view moved, which its camera is not."""
+    view = capture.views[at]
+    image = np.zeros((*view.mask.shape, *view.samples.shape[1:]), np.uint16)
+    image[view.mask] = view.samples
+    mask, image = (np.roll(of, (rows, columns), (0, 1)) for of in (view.mask, image))
+    views = [replace(view, mask=mask, samples=image[mask]) if k == at else of for k, of in enumerate(capture.views)]
+    return Capture(capture.name, tuple(views))
+
+
+def test_views_that_are_kept_back_have_no_part_in_what_becomes_of_the_others(made: Capture) -> None:
+    """A view beside its place moves the cameras of all where it is one of them."""
+    wrong = shifted(made, 3, 1, 2)
+    free, apart, clean = sound(wrong, Progress())[0], sound(wrong, Progress(), [4])[0], sound(made, Progress(), [4])[0]
+    cameras = [[view.camera.translation.tolist() for view in of.views] for of in (free, apart, clean)]
+    assert cameras[0][:3] != cameras[2][:3]
+    assert cameras[1][:3] + cameras[1][4:] == cameras[2][:3] + cameras[2][4:]
+    assert [view.name for view in apart.views] == [view.name for view in made.views]
+
+
+def test_a_view_that_would_be_left_out_may_be_kept_back(made: Capture) -> None:
+    upright, turned = made.views[3], replace(made.views[3], camera=made.views[0].camera)
+    wrong = Capture(made.name, (*made.views[:3], turned, *made.views[4:]))
+    assert [view.name for view in sound(wrong, Progress())[0].views if view.name == upright.name] == []
+    kept, findings = sound(wrong, Progress(), [4])
+    assert kept.views[3] is turned and kept.views[0] is made.views[0]
+    assert [(one.where, one.mended) for one in findings] == [(upright.name, True)] and findings[0].text.startswith("kept back: ")
+
+
+def test_lights_that_are_known_to_differ_are_not_held_against_each_other(made: Capture) -> None:
+    """Two photographs that a view names the other way round: a fault under one rig, none where its lights were given so."""
+    samples = made.views[2].samples.copy()
+    samples[:, [1, 6]] = samples[:, [6, 1]]
+    other = Capture(made.name, tuple(replace(view, samples=samples) if k == 2 else view for k, view in enumerate(made.views)))
+    assert {one.where for one in sound(other, Progress())[1]} == {"view_03/002", "view_03/007"}
+    assert sound(other, Progress(), one_rig=False) == (other, [])

@@ -65,14 +65,16 @@ def free_of_lens(camera: Camera, points: Float) -> Float:
     """Where a pinhole would have image coordinates (n, 2) of the photograph."""
     if not (any(camera.distortion) and len(points)):
         return points
-    return np.asarray(cv2.undistortPoints(points[:, None], camera.K, np.array(camera.distortion), P=camera.K), np.float64)[:, 0]
+    # OpenCV takes the photograph's own K for one without skew.
+    own = points - (points[:, 1:] - camera.K[1, 2]) / camera.K[1, 1] * [camera.K[0, 1], 0]
+    return np.asarray(cv2.undistortPoints(own[:, None], camera.K, np.array(camera.distortion), P=camera.K), np.float64)[:, 0]
 
 
 def seen_at(camera: Camera) -> tuple[Image, Image]:
     """Column and row (height, width) of the photograph, 0 at the first pixel's centre, where each pixel of the pinhole's image is seen."""
     K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     column, row = cv2.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, (camera.width, camera.height), cv2.CV_32FC1)
-    return np.asarray(column), np.asarray(row)
+    return np.asarray(column + K[0, 1] / K[1, 1] * (row - K[1, 2]), np.float32), np.asarray(row)
 
 
 def bent(view: View) -> float:

@@ -150,7 +150,7 @@ def _black(views: Sequence[_Predicted], same_lights: bool) -> dict[tuple[str, in
     return wrong
 
 
-def _found(capture: Capture) -> tuple[Capture, dict[tuple[str, int], str], dict[tuple[str, int], str]]:
+def _found(capture: Capture, one_rig: bool) -> tuple[Capture, dict[tuple[str, int], str], dict[tuple[str, int], str]]:
     """One pass: the capture with photographs put back, what was put back, and what is wrong and to be left out."""
     generator = np.random.default_rng(0)
     enough = [view for view in capture.views if int(view.usable().any(0).sum()) >= FEWEST_LIGHTS]
@@ -158,7 +158,7 @@ def _found(capture: Capture) -> tuple[Capture, dict[tuple[str, int], str], dict[
     views = on_cores(_predicted, samples)
     if not views:
         return capture, {}, {}
-    same_lights = len({view.lights for view in enough}) == 1
+    same_lights = one_rig and len({view.lights for view in enough}) == 1
     wrong = _unrelated(views, same_lights) | _black(views, same_lights)
     # Of what is left out nothing more need be said; its light is looked for where it belongs to the view.
     if wrong or not same_lights:
@@ -178,11 +178,12 @@ def _found(capture: Capture) -> tuple[Capture, dict[tuple[str, int], str], dict[
     return Capture(capture.name, tuple(changed)), put_back, wrong
 
 
-def photographs(capture: Capture) -> tuple[Capture, list[Finding]]:
-    """The capture without photographs that do not belong (they are no data then), those of a rig that changed places put back."""
+def photographs(capture: Capture, one_rig: bool = True) -> tuple[Capture, list[Finding]]:
+    """The capture without photographs that do not belong (they are no data then), those of a rig that changed places put back. one_rig:
+    lights of the same number may be the same in all views."""
     findings: list[Finding] = []
     for _ in range(PASSES):
-        after, back, wrong = _found(capture)
+        after, back, wrong = _found(capture, one_rig)
         if not back and not wrong:
             break
         findings += [Finding("photograph", f"{view}/{light:03d}", text, True) for (view, light), text in back.items()]

@@ -26,6 +26,10 @@ FEWEST_VIEWS = 3
 """Of two views that differ none is the one to believe."""
 
 
+SUSPECT = 2.0
+"""Residual with the other views' coefficients, over that with a view's own, from which a photograph may be of another light."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Fit:
     """A view by the coefficients of the others: values M and predictions P (n, lights), residuals (lights,)."""
@@ -45,11 +49,11 @@ def _fit(M: Float, gram: Float) -> _Fit:
     return _Fit(M, np.where(best == 0, tried[0], tried[1]), np.choose(best, left))
 
 
-def _of_light(fit: _Fit, light: int) -> int | None:
+def _of_light(fit: _Fit, common: Float, light: int) -> int | None:
     """The light that the photograph at the place `light` was taken under, if another halves its residual; `light` itself where adding
-    another, or another exposure, does."""
+    another, or another exposure, does. common (lights,): the units of the lights' photographs."""
     M, P, half = fit.M, fit.P, fit.left[light] / 2
-    alone = medians(M[:, light : light + 1] - P, P > LIT)
+    alone = medians(M[:, light : light + 1] * common[light] / common - P, P > LIT)
     if np.isfinite(alone).any() and np.nanmin(alone) < half:
         return int(np.nanargmin(alone))
     own, image = P[:, light], M[:, light]
@@ -62,21 +66,24 @@ def _of_light(fit: _Fit, light: int) -> int | None:
     return None
 
 
-def _of_view(M: Float, gram: Float, own: Float, far: Bool) -> tuple[dict[int, int], dict[int, int]]:
-    """Two photographs of a view to exchange, or else the worst to leave out, by place with the light's place. own (lights,): residuals by
-    the view's own coefficients; far (lights,): which are outliers. One at a time, for one spoils the predictions of all."""
+def _of_view(M: Float, common: Float, gram: Float, own: Float, far: Bool) -> tuple[dict[int, int], dict[int, int]]:
+    """Two photographs of a view to exchange, or else the worst to leave out, by place with the light's place. M (n, lights) in units of the
+    lights, common (lights,); own (lights,): residuals by the view's own coefficients; far (lights,): which are outliers. One at a time, for
+    one spoils the predictions of all."""
     fit = _fit(M, gram)
-    suspects = np.flatnonzero(far & (np.nan_to_num(fit.left) > 2 * np.nan_to_num(own, nan=np.inf)))
+    suspects = np.flatnonzero(far & (np.nan_to_num(fit.left) > SUSPECT * np.nan_to_num(own, nan=np.inf)))
     worse = np.log(fit.left / own)
     exchanges: list[tuple[float, int, int]] = []
     without: list[tuple[float, int]] = []
     for k in suspects.tolist():
         for light in np.flatnonzero(np.isfinite(own)).tolist():
-            swapped = M.copy()
-            swapped[:, [k, light]] = M[:, [light, k]]
+            swapped, of_swapped, pair, other = M.copy(), own.copy(), [k, light], [light, k]
+            units = common[other] / common[pair]
+            swapped[:, pair], of_swapped[pair] = M[:, other] * units, own[other] * units
             after = _fit(swapped, gram).left
-            if (after[[k, light]] < fit.left[[k, light]]).all():
-                exchanges.append((float(np.nansum(np.log(after / own) - worse)), k, light))
+            # In their places neither is a suspect any longer.
+            if (after[pair] < SUSPECT * of_swapped[pair]).all():
+                exchanges.append((float(np.nansum(np.log(after / of_swapped) - worse)), k, light))
         rest = M.copy()
         rest[:, k] = 0
         without.append((float(np.nansum(np.delete(np.log(_fit(rest, gram).left / own) - worse, k))), k))
@@ -85,7 +92,7 @@ def _of_view(M: Float, gram: Float, own: Float, far: Bool) -> tuple[dict[int, in
     if change < -2 * np.log(2):
         return {k: light, light: k}, {}
     change, k = min(without, default=(0.0, 0))
-    under = _of_light(fit, k) if change < -np.log(2) else None
+    under = _of_light(fit, common, k) if change < -np.log(2) else None
     return {}, {} if under is None else {k: under}
 
 
@@ -100,6 +107,7 @@ def rig_faults(views: Sequence[Sampled], residuals: Sequence[Float]) -> tuple[di
     # Coefficients are the same in all views only where the lights have the same units.
     common = np.median([of.level for of in views], axis=0)
     values = [of.values * (of.level / common) for of in views]
+    residuals = [own * (of.level / common) for of, own in zip(views, residuals, strict=True)]
     grams = np.stack([M.T @ M for M in values])
     of_others = [_mean(np.delete(grams, i, axis=0)) for i in range(len(views))]
     fits = on_cores(_fit, values, of_others)
@@ -111,7 +119,7 @@ def rig_faults(views: Sequence[Sampled], residuals: Sequence[Float]) -> tuple[di
     back: dict[str, dict[int, int]] = {}
     wrong: dict[tuple[str, int], str] = {}
     for of, M, gram, own, far in zip(views, values, of_others, residuals, outliers(worse, True), strict=True):
-        exchanged, others = _of_view(M, gram, own, far)
+        exchanged, others = _of_view(M, common, gram, own, far)
         if exchanged:
             back[of.view.name] = exchanged
         for k, light in others.items():

@@ -37,6 +37,8 @@ def side_by_side(truth: Float, found: Mapping[str, Float]) -> NDArray[np.uint8]:
 def cropped(truth: Float) -> tuple[slice, slice]:
     """The box around what is known of normals (h, w, 3)."""
     known = np.asarray(np.isfinite(truth).all(-1))
+    if not known.any():
+        return slice(None), slice(None)
     rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
     return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
 

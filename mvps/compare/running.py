@@ -1,4 +1,5 @@
-"""Every method in a process of its own, so that its time and its largest memory are its own. What has run with the same options stays.
+"""Every method in a process of its own, so that its time and its largest memory are its own. What has run with the same options on
+the same files stays.
 
 Seconds are of the whole process, imports and reading included; processor seconds, of all cores, say less of what else the machine does.
 Memory is the largest resident set.
@@ -6,6 +7,7 @@ Memory is the largest resident set.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -18,6 +20,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mvps.checkpoint import program
 from mvps.command import not_ended
 from mvps.evaluate import evaluate_result, write_json
 from mvps.inputs import DAMAGED, JSON_LIMIT, parsed_json, read_file, shown
@@ -32,7 +35,7 @@ RUNS = "runs.json"
 class Run:
     """What came of a method. capture (its folder) and options (of mvps.methods): by which a run is known; failed: why there is no result,
     else empty; status: of the result; protocols: of mvps.evaluate that were measured; errors: by their names, where the capture has
-    truth."""
+    truth; made_of: the program and the capture's files, as they were."""
 
     method: str
     options: tuple[str, ...]
@@ -44,6 +47,7 @@ class Run:
     protocols: tuple[str, ...] = ()
     errors: dict[str, float] = field(default_factory=dict)
     capture: str = ""
+    made_of: str = ""
 
 
 def known_runs(out: Path) -> dict[str, Run]:
@@ -72,19 +76,28 @@ def run_all(
     if out.exists() and any(out.iterdir()) and not (out / RUNS).exists():
         raise CaptureError(f"{out}: wanted a new or empty folder or an earlier comparison, given a folder with other files")
     out.mkdir(parents=True, exist_ok=True)
-    runs, place = known_runs(out), shown(capture.resolve())
+    runs, place, made_of = known_runs(out), shown(capture.resolve()), state(capture)
     # What is interrupted in its first run is an earlier comparison too.
     write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
     for name in methods:
         known = runs.get(name)
-        same = known is not None and known.options == tuple(options) and known.capture == place and not known.failed
+        same = known is not None and (known.options, known.capture, known.made_of) == (tuple(options), place, made_of) and not known.failed
         if not same or not (out / name / "settings.json").exists():
             with progress.stage(name) as stage:
-                runs[name] = replace(_run(capture, name, options, out / name), capture=place)
+                runs[name] = replace(_run(capture, name, options, out / name), capture=place, made_of=made_of)
                 stage.status(runs[name].failed or runs[name].status)
         runs[name] = _measured(runs[name], capture, out / name, protocols)
         write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
     return runs
+
+
+def state(capture: Path) -> str:
+    """Hash of the program, and of the capture's files by name, size and time: of another state a run is another."""
+    digest = hashlib.blake2b(program().encode(), digest_size=16)
+    for path in sorted(path for path in capture.rglob("*") if path.is_file()):
+        about = path.stat()
+        digest.update(repr((str(path.relative_to(capture)), about.st_size, about.st_mtime_ns)).encode("utf-8", "surrogateescape"))
+    return digest.hexdigest()
 
 
 def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:

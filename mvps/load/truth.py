@@ -6,33 +6,38 @@ CAPTURE/view_01/light_intensities.txt   red, green, blue per light
 CAPTURE/mesh_Gt.ply                     world frame and units
 
 x_world = rotation^T DILIGENT_FROM_CAMERA^T x_diligent
+
+with the rotation of the camera as it is used: lamps and normals are measured with the camera, and turn with it where it is moved.
 """
 
 from __future__ import annotations
 
 import io
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.inputs import DAMAGED
-from mvps.load.calibration import LARGEST, Calibration, read_calibration
+from mvps.load.calibration import LARGEST, read_calibration
 from mvps.load.diligent import view_folders
 from mvps.load.images import TEXT_LIMIT, complaint, read_bytes, read_mask
 from mvps.load.matfile import numbers_of, read_variables
-from mvps.scene import Capture, Float, Lights, Surface, Truth
+from mvps.scene import Camera, Capture, Float, Lights, Surface, Truth
 
 ONE_RIG_TOLERANCE = 1e-3
 """Radians between two views' light directions that still count as the same: the files print 4 digits or more."""
 
 
-def read_truth(path: str | Path) -> Truth:
+def read_truth(path: str | Path, cameras: Mapping[str, Camera] = MappingProxyType({})) -> Truth:
     """The ground truth that lies in a capture's folder; what is absent there is absent in the result.
 
-    Raises CaptureError about files that are there and wrong.
+    cameras: of views, by name, whose cameras are not those of the files any longer. Raises CaptureError about files that are there and
+    wrong.
     """
     root = Path(path)
     calibration = read_calibration(root)
@@ -40,13 +45,19 @@ def read_truth(path: str | Path) -> Truth:
     folders = view_folders(root, calibration, [n for n in present if n in calibration.rotation] or None)
     normals, direction, intensity = {}, {}, {}
     for number, folder in folders.items():
-        world_from_diligent = _world_from_diligent(calibration, number)
+        rotation = cameras[folder.name].rotation if folder.name in cameras else calibration.rotation[number]
+        world_from_diligent = _world_from_diligent(rotation)
         if os.path.lexists(folder / "Normal_gt.mat"):
             normals[folder.name] = _normals(folder, world_from_diligent)
         if os.path.lexists(folder / "light_directions.txt"):
             direction[folder.name] = _directions(folder) @ world_from_diligent.T
         if os.path.lexists(folder / "light_intensities.txt"):
             intensity[folder.name] = _table(folder / "light_intensities.txt", positive=True)
+        known = [len(of[folder.name]) for of in (direction, intensity) if folder.name in of]
+        if len(set(known)) > 1:
+            raise complaint(
+                folder / "light_intensities.txt", f"{known[0]} lines, as light_directions.txt has", f"{known[1]}", "add the rest"
+            )
     mesh = root / "mesh_Gt.ply"
     return Truth(
         views=tuple(folder.name for folder in folders.values()),
@@ -60,11 +71,10 @@ def read_truth(path: str | Path) -> Truth:
 def read_calibrated_lights(path: str | Path, capture: Capture) -> Lights:
     """The lights given with a capture, for the views and lights that `capture` holds, matched by their numbers.
 
-    Directions in the world frame; intensities divided by their mean over all lights and channels. CaptureError where a
-    file or a light is missing.
+    Directions in the world frame, by the capture's own cameras; intensities divided by their mean over all lights and channels.
+    CaptureError where a file or a light is missing.
     """
     root = Path(path)
-    calibration = read_calibration(root)
     directions, intensities, in_camera = [], [], []
     for view in capture.views:
         folder = root / view.name
@@ -75,7 +85,7 @@ def read_calibrated_lights(path: str | Path, capture: Capture) -> Lights:
                 raise complaint(folder / name, wanted, f"{len(table)} lines", "add the missing lights")
         rows = np.array(view.lights) - 1
         in_camera.append(tables[0][rows])
-        directions.append(in_camera[-1] @ _world_from_diligent(calibration, int(view.name[5:])).T)
+        directions.append(in_camera[-1] @ _world_from_diligent(view.camera.rotation).T)
         intensities.append(tables[1][rows])
     mean = np.concatenate(intensities).mean()
     numbered = all(view.lights == capture.views[0].lights for view in capture.views)
@@ -89,8 +99,8 @@ def _alike(directions: list[Float]) -> bool:
     return all(np.linalg.norm(of_view - directions[0], axis=-1).max() <= ONE_RIG_TOLERANCE for of_view in directions)
 
 
-def _world_from_diligent(calibration: Calibration, number: int) -> Float:
-    world_from_diligent: Float = calibration.rotation[number].T @ DILIGENT_FROM_CAMERA.T
+def _world_from_diligent(rotation: Float) -> Float:
+    world_from_diligent: Float = rotation.T @ DILIGENT_FROM_CAMERA.T
     return world_from_diligent
 
 

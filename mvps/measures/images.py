@@ -33,7 +33,8 @@ def rendered(
 
     caster, senders = ray_caster(surface), light_senders(surface, material)
     for view in capture.views:
-        kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights]
+        # One that was left out shows nothing.
+        kept = [k for k, number in enumerate(view.lights) if (view.name, number) in lights and view.shown[k]]
         if kept:
             direction, intensity = (np.stack(rows) for rows in zip(*(lights[view.name, view.lights[k]] for k in kept), strict=True))
             arriving = light_arriving(senders, direction, view.camera.centre)

@@ -115,9 +115,9 @@ def psnerf_image_errors(
 
 def relative_intensity(view: View, positions: Sequence[int], intensity: Mapping[str, Float]) -> Float:
     """(positions, 3) intensities of these of the view's lights over that of its fourth (of its last, where it has fewer); 1 if unknown."""
-    if view.name not in intensity:
+    true = intensity.get(view.name, np.zeros((0, 3)))
+    if len(true) < max(view.lights[k] for k in positions):
         return np.ones((len(positions), 3))
-    true = intensity[view.name]
     relative: Float = true[[view.lights[k] - 1 for k in positions]] / true[min(REFERENCE_LIGHT, len(true)) - 1]
     return relative
 
