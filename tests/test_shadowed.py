@@ -103,6 +103,20 @@ def test_two_fifths_of_the_shadows_that_are_lit_do_not_change_that(seen: Seen) -
     assert told is not None and abs(told / BOUNCE - 1) < 0.25
 
 
+def test_lit_shadows_do_not_make_surfaces_return_more_than_they_receive(seen: Seen) -> None:
+    """Three in ten, where what arrives is known to a factor of two only: weights of what pixels hold then tell what cannot be."""
+    g, wrong = torch.Generator().manual_seed(0), []
+    for s in seen.samples:
+        assert s.gathered is not None
+        factor = torch.exp(0.8 * torch.randn(s.image.shape, generator=g))
+        image = torch.where(torch.rand(s.image.shape, generator=g) < 0.3, s.image.new_tensor(ALBEDO), s.image)
+        wrong.append(replace(s, gathered=(s.gathered.reshape(factor.shape) * factor).reshape(s.gathered.shape), image=image))
+    most = 1 / ALBEDO
+    runaway, told = (bounce_in_shadow(wrong, seen.vertices, seen.grey, DIFFUSE, 0.0, most=bound) for bound in (np.inf, most))
+    assert runaway is not None and told is not None and runaway > most and abs(told / BOUNCE - 1) < 0.3
+    assert told_by_shadows(wrong, seen.vertices, seen.grey, DIFFUSE, (True, True, False), 0.0)[0].bounce == pytest.approx(told)
+
+
 @pytest.mark.parametrize("unit", [1e-6, 1e6])
 def test_the_photographs_unit_is_of_no_account(seen: Seen, unit: float) -> None:
     other = [replace(s, image=unit * s.image, gathered=None if s.gathered is None else unit * s.gathered) for s in seen.samples]

@@ -302,7 +302,8 @@ def told_by_shadows(
     """The law with the bounce that shadows alone tell (shadowed.py, noise and times too), and what is left free of it; as they were
     where lobes take part, and where shadows are too few."""
     _, bounce, gleam = free
-    told = bounce_in_shadow(views, vertices, lights, law, noise, times) if bounce and not gleam else None
+    most = _most_returned(law, vertices)
+    told = bounce_in_shadow(views, vertices, lights, law, noise, times, most) if bounce and not gleam else None
     if told is None:
         return law, free
     return _bounded(law, law.grazing, told, law.gleam, vertices), (free[0], False, False)
@@ -383,10 +384,15 @@ def told_of_strengths(
 
 def _bounded(law: Law, grazing: float, bounce: float, gleam: float, vertices: Vertices) -> Law:
     """The law with these, within LARGEST_GRAZING and so that the median point, lobes and all, returns no more than it receives."""
-    reflected = vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))
-    most = 1 / max(float(reflected.median()), 1e-300)
+    most = _most_returned(law, vertices)
     bounce, gleam = (min(max(value, 0.0), most) for value in (bounce, gleam))
     return replace(law, grazing=min(max(grazing, -LARGEST_GRAZING), LARGEST_GRAZING), bounce=bounce, gleam=gleam)
+
+
+def _most_returned(law: Law, vertices: Vertices) -> float:
+    """The strength at which the median point returns as much light as it receives."""
+    reflected = vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))
+    return 1 / max(float(reflected.median()), 1e-300)
 
 
 def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:

@@ -11,7 +11,9 @@ with the weights
 of the pair w and the sample. Weights x would minimise sum w |I - b x|, but x, worked out on a mesh that is not yet right, is known less
 well than I, and they favour samples whose x is too large: with errors of a factor exp(+-s) b comes out exp(-s^2) times too small
 (regression dilution). Weights I favour neither. But where the mesh is wrong, what it thinks in shadow is lit: the farther a sample is
-beyond twice what b predicts, the less it counts.
+beyond twice what b predicts, the less it counts. That breaks down where half of what should be dark is lit: b grows with every renewal, and
+what counts with it. Then the median point would return more light than it receives, and weights x, of which such samples have little, tell
+b.
 
 Pixels are never below zero, so that samples, interpolated between them, hold some of their noise where nothing arrives. Samples with
 x / albedo over BEYOND_NOISE standard deviations of it would hardly be misled, but are those whose x came out too large, and tell too
@@ -22,6 +24,7 @@ Where lobes take part (gleam.py) two strengths would have to be told apart, whic
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import torch
@@ -60,13 +63,20 @@ def in_shadow(samples: ViewSamples) -> ViewSamples:
 
 
 def bounce_in_shadow(
-    views: list[ViewSamples], vertices: Vertices, lights: list[DirectionalLights], law: Law, noise: float, times: int = TIMES
+    views: list[ViewSamples],
+    vertices: Vertices,
+    lights: list[DirectionalLights],
+    law: Law,
+    noise: float,
+    times: int = TIMES,
+    most: float = math.inf,
 ) -> float | None:
     """The bounce that shadows tell; None where too few beyond the noise do. A median of ratios I / x, counted in steps:
     samples are too many to be kept.
 
     noise: standard deviation of dark pixels' over the root mean square of samples in the light (noise.py).
     times: that weights are renewed; 0 leaves weights x, with which b, too small, predicts samples best (least absolute errors).
+    most: beyond which b cannot be, so that weights are not renewed.
     """
     sending = vertices.reflectance[:, 0]
     albedo = float(sending[sending > 0].median()) if bool((sending > 0).any()) else 1.0
@@ -86,7 +96,8 @@ def bounce_in_shadow(
     if count < LEAST_SAMPLES:
         return None
     by_all, by_sure = _strength(of_all, times), _strength(of_sure, times)
-    return (by_all if by_all <= FAR * by_sure else by_sure) / albedo
+    believed, told = (by_all, of_all) if by_all <= FAR * by_sure else (by_sure, of_sure)
+    return (believed if believed <= most * albedo else _strength(told, 0)) / albedo
 
 
 def _strength(told: Tensor, times: int) -> float:
