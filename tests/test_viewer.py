@@ -52,18 +52,32 @@ def test_the_page_holds_the_model(scene: SphereScene) -> None:
     about = json.loads(re.search(r'id="viewer-about">(.*?)</script>', html)[1])  # type: ignore[index]
     data = zlib.decompress(base64.b64decode(re.search(r'id="viewer-data">(.*?)</script>', html)[1]))  # type: ignore[index]
     V, F = about["vertices"], about["faces"]
-    assert (len(r.surface.vertices), len(r.surface.faces)) == (V, F) and len(data) == 20 * V + 12 * F
-    parts = np.split(np.frombuffer(data, np.uint8), np.cumsum([6 * V, 6 * V, 3 * V, 4 * V, V]))
+    assert (len(r.surface.vertices), len(r.surface.faces)) == (V, F) and len(data) == 23 * V + 12 * F
+    parts = np.split(np.frombuffer(data, np.uint8), np.cumsum([6 * V, 6 * V, 3 * V, 4 * V, 3 * V, V]))
     low, high = np.array(about["low"]), np.array(about["high"])
     position = low + parts[0].view("<u2").reshape(V, 3) / 65535 * (high - low)
     np.testing.assert_allclose(position, r.surface.vertices, atol=1e-3)
     np.testing.assert_allclose(parts[1].view("<i2").reshape(V, 3) / 32767, r.material.normal, atol=1e-4)
     np.testing.assert_allclose((parts[2].reshape(V, 3) / 255) ** 2 * about["white"], r.material.albedo, atol=0.01)
     weight = (parts[3].reshape(V, 4) / 255) ** 2 * about["lobe_white"]
-    coloured = weight[:, :2, None] * np.array(about["tint"])[:2]
+    hue = (parts[4].reshape(V, 1, 3) / 255) ** 2 * about["hue_white"]
+    coloured = weight[:, :2, None] * np.array(about["tint"])[:2] * hue
     np.testing.assert_allclose(coloured, r.material.specular_weight, atol=0.005)
     assert about["sharpness"][:2] == [12, 60] and not weight[:, 2:].any()
-    np.testing.assert_array_equal(parts[5].view("<u4").reshape(F, 3), r.surface.faces)
+    np.testing.assert_array_equal(parts[6].view("<u4").reshape(F, 3), r.surface.faces)
+
+
+def test_lobes_may_have_another_colour_at_every_place(scene: SphereScene) -> None:
+    """Red on one half, blue on the other: no purple."""
+    surface, weight = scene.reconstruction.surface, scene.reconstruction.material.specular_weight.mean(2, keepdims=True)
+    colour = np.where(surface.vertices[:, :1, None] > 0, [1.5, 0.6, 0.9], [0.3, 0.6, 2.1])
+    material = replace(scene.reconstruction.material, specular_weight=weight * colour)
+    about, packed_bytes = packed(surface, material)
+    data, V = np.frombuffer(zlib.decompress(packed_bytes), np.uint8), len(surface.vertices)
+    grey = (data[15 * V : 19 * V].reshape(V, 4) / 255) ** 2 * about["lobe_white"]
+    hue = (data[19 * V : 22 * V].reshape(V, 1, 3) / 255) ** 2 * about["hue_white"]
+    shown = grey[:, :2, None] * np.array(about["tint"])[:2] * hue
+    np.testing.assert_allclose(shown, material.specular_weight, atol=0.02 * float(weight.max()))
 
 
 def test_only_the_strongest_lobes_of_an_edited_material(scene: SphereScene) -> None:

@@ -65,16 +65,20 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
     kept = np.sort(np.argsort(-weight.sum((0, 2)), kind="stable")[:MOST_LOBES])
     weight, sharpness = weight[:, kept], material.sharpness[kept]
     total = weight.sum(0)
-    # The colour of a lobe is one for the object (joint/colours.py).
     tint = np.where(total.sum(1, keepdims=True) > 0, 3 * total / np.maximum(total.sum(1, keepdims=True), 1e-300), 1.0)
     grey = np.zeros((len(surface.vertices), MOST_LOBES))
     grey[:, : len(kept)] = weight.mean(2)
-    white, lobe_white = float(np.quantile(material.albedo, 0.999)) or 1.0, np.maximum(grey.max(0), 1e-12)
+    # Of places whose lobes have another colour than the object's in the mean (joint/colours.py, edits).
+    common = np.einsum("vk,kc->vc", grey[:, : len(kept)], tint)
+    hue = np.where(common > 0, weight.sum(1) / np.where(common > 0, common, 1), 1.0)
+    white, hue_white = float(np.quantile(material.albedo, 0.999)) or 1.0, max(float(hue.max()), 1e-12)
+    lobe_white = np.maximum(grey.max(0), 1e-12)
     arrays = (
         np.rint(65535 * (surface.vertices - low) / span).astype("<u2"),
         np.rint(32767 * material.normal).astype("<i2"),
         _root_bytes(material.albedo, white),
         _root_bytes(grey, lobe_white),
+        _root_bytes(hue, hue_white),
         np.rint(255 * material.confidence).astype(np.uint8),
         surface.faces.astype("<u4"),
     )
@@ -85,6 +89,7 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
         "high": high.tolist(),
         "white": white,
         "lobe_white": lobe_white.tolist(),
+        "hue_white": hue_white,
         "sharpness": [*sharpness.tolist(), *[1.0] * (MOST_LOBES - len(kept))],
         "tint": [*tint.tolist(), *[[1.0] * 3] * (MOST_LOBES - len(kept))],
         "grazing": material.grazing,

@@ -14,7 +14,8 @@
     const bytes = await new Response(new Blob([packed]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
     let at = 0;
     const take = (length) => { const part = bytes.slice(at, at + length); at += length; return part; };
-    return { position: take(6 * V), normal: take(6 * V), albedo: take(3 * V), weight: take(4 * V), confidence: take(V), faces: take(12 * F) };
+    return { position: take(6 * V), normal: take(6 * V), albedo: take(3 * V), weight: take(4 * V), hue: take(3 * V),
+      confidence: take(V), faces: take(12 * F) };
   };
   const arrays = await unpacked(byId("viewer-data").textContent);
 
@@ -54,11 +55,11 @@
   // ---- programs ----
   const MOST = 4, SKY = 32, SIDE = 2048;
   const ATTRIBUTES = [["position", 3, gl.UNSIGNED_SHORT], ["normal", 3, gl.SHORT], ["albedo", 3, gl.UNSIGNED_BYTE],
-    ["weight", 4, gl.UNSIGNED_BYTE], ["confidence", 1, gl.UNSIGNED_BYTE], ["reached", 4, gl.UNSIGNED_BYTE]];
+    ["weight", 4, gl.UNSIGNED_BYTE], ["hue", 3, gl.UNSIGNED_BYTE], ["confidence", 1, gl.UNSIGNED_BYTE], ["reached", 4, gl.UNSIGNED_BYTE]];
   const MODEL = `
-    uniform vec3 tint[4]; uniform vec4 sharpness, lobeWhite; uniform float white, grazing; uniform int layer; uniform bool microfacet;
+    uniform vec3 tint[4]; uniform vec4 sharpness, lobeWhite; uniform float white, hueWhite, grazing; uniform int layer; uniform bool microfacet;
     float D(float c) { float g = 1.0 - max(c, 0.0); return 1.0 + grazing * g * g * g; }
-    vec3 shine(vec4 w, vec3 N, vec3 v, vec3 l, float wide) {
+    vec3 shine(vec4 w, vec3 h, vec3 N, vec3 v, vec3 l, float wide) {
       float hn = dot(normalize(v + l), N);
       vec3 sum = vec3(0.0);
       for (int k = 0; k < 4; k++) {
@@ -66,30 +67,30 @@
         float lobe = exp(s * (hn - 1.0)), spread = 1.0 + s / 4.0 * (1.0 - hn * hn);
         sum += w[k] * w[k] * lobeWhite[k] * tint[k] * duller * (microfacet ? 1.0 / (spread * spread) : lobe);
       }
-      return sum * min(2.0 / max(1.0 + dot(v, l), 1e-6), 4.0);
+      return sum * h * h * hueWhite * min(2.0 / max(1.0 + dot(v, l), 1e-6), 4.0);
     }
     // wide: variance of the directions that a light stands for, as in mvps/shading.py.
-    vec3 lit(vec3 body, vec4 w, vec3 N, vec3 v, vec3 l, float wide) {
+    vec3 lit(vec3 body, vec4 w, vec3 h, vec3 N, vec3 v, vec3 l, float wide) {
       vec3 matte = layer == 2 ? vec3(0.0) : body * D(dot(N, l)) * D(dot(N, v));
-      return (matte + shine(w, N, v, l, wide)) * max(dot(N, l), 0.0);
+      return (matte + shine(w, h, N, v, l, wide)) * max(dot(N, l), 0.0);
     }`;
   const VERTEX = `#version 300 es
     precision highp float; precision highp int;
-    in vec3 position; in vec3 normal; in vec3 albedo; in vec4 weight; in float confidence; in vec4 reached; in uint open;
+    in vec3 position; in vec3 normal; in vec3 albedo; in vec4 weight; in vec3 hue; in float confidence; in vec4 reached; in uint open;
     uniform vec3 low, high, eye, sky[${SKY}], skyColour[${SKY}]; uniform float skyWide[${SKY}]; uniform mat4 view; uniform int around;
-    out vec3 x, n, rho, surrounding; out vec4 w, seen; out float certain;
+    out vec3 x, n, rho, surrounding, h; out vec4 w, seen; out float certain;
     ${MODEL}
     void main() {
-      x = mix(low, high, position); n = normal; rho = albedo; w = weight; seen = reached; certain = confidence;
+      x = mix(low, high, position); n = normal; rho = albedo; w = weight; h = hue; seen = reached; certain = confidence;
       surrounding = vec3(0.0);
       vec3 N = normalize(n), v = normalize(eye - x);
       for (int k = 0; k < around; k++)
-        if (((open >> uint(k)) & 1u) == 1u) surrounding += skyColour[k] * lit(rho * rho * white, w, N, v, sky[k], skyWide[k]);
+        if (((open >> uint(k)) & 1u) == 1u) surrounding += skyColour[k] * lit(rho * rho * white, w, h, N, v, sky[k], skyWide[k]);
       gl_Position = view * vec4(x, 1.0);
     }`;
   const FRAGMENT = `#version 300 es
     precision highp float; precision highp int; precision highp sampler2DArrayShadow;
-    in vec3 x, n, rho, surrounding; in vec4 w, seen; in float certain;
+    in vec3 x, n, rho, surrounding, h; in vec4 w, seen; in float certain;
     uniform vec3 eye, light[${MOST}], lamp[${MOST}]; uniform int lights;
     uniform float exposure, fill, away; uniform vec2 range; uniform bool traced; uniform mat4 fromLight[${MOST}]; uniform sampler2DArrayShadow depths;
     out vec4 colour;
@@ -121,8 +122,8 @@
         colour = vec4(vec3(hidden / max(all, 1e-12)), 1.0);
         return;
       }
-      vec3 shown = surrounding + fill * away * away / dot(eye - x, eye - x) * lit(body, w, N, v, v, 0.0);
-      for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, N, v, light[k], 0.0) * visibility(k);
+      vec3 shown = surrounding + fill * away * away / dot(eye - x, eye - x) * lit(body, w, h, N, v, v, 0.0);
+      for (int k = 0; k < lights; k++) shown += lamp[k] * lit(body, w, h, N, v, light[k], 0.0) * visibility(k);
       colour = vec4(srgb(shown * exposure), 1.0);
     }`;
   const DEPTH = `#version 300 es
@@ -162,6 +163,7 @@
     gl.vertexAttribPointer(k, size, type, true, 0, 0);
     return buffer;
   });
+  const bufferOf = (name) => buffers[ATTRIBUTES.findIndex(([of]) => of === name)];
   const openBuffer = filled(open, ATTRIBUTES.length);
   gl.vertexAttribIPointer(ATTRIBUTES.length, 1, gl.UNSIGNED_INT, 0, 0);
   gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
@@ -245,6 +247,7 @@
     set(shown, "sharpness", "4fv", about.sharpness);
     set(shown, "lobeWhite", "4fv", about.lobe_white);
     set(shown, "white", "1f", about.white);
+    set(shown, "hueWhite", "1f", about.hue_white);
     set(shown, "grazing", "1f", about.grazing);
     set(shown, "exposure", "1f", exposure());
     set(shown, "away", "1f", away);
@@ -288,7 +291,7 @@
         if (next >= lights.length) continue;
         const seen = new Uint8Array(await bytesOf("shadow?light=" + words(lights[next].direction)));
         for (let i = 0; i < V; i++) reached[4 * i + next] = seen[i];
-        gl.bindBuffer(gl.ARRAY_BUFFER, buffers[5]);
+        gl.bindBuffer(gl.ARRAY_BUFFER, bufferOf("reached"));
         gl.bufferSubData(gl.ARRAY_BUFFER, 0, reached);
         canvas.dataset.traced = String(Number(canvas.dataset.traced || 0) + 1);
         later();
@@ -352,8 +355,8 @@
     // A later choice may have been answered first.
     if (mine !== dressing) return;
     Object.assign(about, answer.about);
-    ["albedo", "weight"].forEach((name) => {
-      gl.bindBuffer(gl.ARRAY_BUFFER, buffers[ATTRIBUTES.findIndex(([of]) => of === name)]);
+    ["albedo", "weight", "hue"].forEach((name) => {
+      gl.bindBuffer(gl.ARRAY_BUFFER, bufferOf(name));
       gl.bufferSubData(gl.ARRAY_BUFFER, 0, found[name]);
     });
     canvas.dataset.dressed = String(Number(canvas.dataset.dressed || 0) + 1);
