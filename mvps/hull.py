@@ -5,10 +5,13 @@ At depth z_i a pixel covers z_i / f_i world units, so
 
     d(x) = max_i m_i(x) z_i / f_i
 
-is zero on the hull and a lower bound of the distance near it (Laurentini 1994 for the hull).
+is zero on the hull and a lower bound of the distance near it (Laurentini 1994 for the hull). A view whose frame cuts the object off says
+nothing of what lies beyond that border, if those that hold all of it enclose it by themselves; else what is beyond counts as outside.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +22,7 @@ from mvps.camera import pixel_footprint, project
 from mvps.cores import on_cores
 from mvps.mesh import largest_pieces, piece_count
 from mvps.once import once_for
-from mvps.scene import Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
+from mvps.scene import Bool, Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
 from mvps.silhouette import beyond_mask, mask_distances
 
 MARGIN_CELLS = 3
@@ -35,18 +38,54 @@ MINIMUM_CELLS_ACROSS = 8
 """A hull thinner than this many coarse cells is no solid that masks could have made."""
 
 
-def bounds(capture: Capture) -> tuple[Float, Float]:
-    """Corners (3,), (3,) of the smallest axis-parallel box that holds the intersection of the masks' bounding pyramids.
+class Box(NamedTuple):
+    """Corners low, high (3,) of a box around the object; frame_open: whether views say nothing of what lies beyond borders that cut it
+    off."""
 
-    Each mask's bounding rectangle cuts half-spaces a . x <= b from the world; six linear programmes find the box.
+    low: Float
+    high: Float
+    frame_open: bool
+
+
+@once_for
+def masks_box(capture: Capture) -> Box:
+    """The smallest axis-parallel box that holds the intersection of the masks' bounding pyramids, without the sides along which frames cut
+    the object off, if those views that hold all of it enclose it by themselves.
+
     Raises CaptureError where the pyramids do not meet or leave the object unbounded (one view, or wrong poses).
+    """
+    whole = tuple(view for view in capture.views if not frame(view.mask).any())
+    frame_open = len(whole) == len(capture.views) or (bool(whole) and encloses(Capture(capture.name, whole)))
+    return Box(*bounds(capture, frame_open), frame_open)
+
+
+def encloses(capture: Capture) -> bool:
+    """Whether the masks' bounding pyramids meet and bound an object."""
+    try:
+        bounds(capture, False)
+    except CaptureError:
+        return False
+    return True
+
+
+def frame(mask: Bool) -> Bool:
+    """(4,) whether a mask (height, width) reaches the image's left, right, upper and lower border."""
+    return np.array([mask[:, 0].any(), mask[:, -1].any(), mask[0].any(), mask[-1].any()])
+
+
+def bounds(capture: Capture, frame_open: bool) -> tuple[Float, Float]:
+    """Corners (3,), (3,) of `masks_box`, with all sides of the masks' bounding rectangles, or without those on the frame.
+
+    Each side cuts a half-space a . x <= b from the world; six linear programmes find the box.
     """
     normals, offsets = [], []
     for view in capture.views:
         rows, columns = np.nonzero(view.mask)
         P = view.camera.K @ np.column_stack([view.camera.rotation, view.camera.translation])
         sides = [(columns.min(), 0, 1.0), (columns.max() + 1, 0, -1.0), (rows.min(), 1, 1.0), (rows.max() + 1, 1, -1.0)]
-        for limit, axis, sign in sides:
+        for (limit, axis, sign), on_frame in zip(sides, frame(view.mask), strict=True):
+            if on_frame and frame_open:
+                continue
             plane = sign * (limit * P[2] - P[axis])
             normals.append(plane[:3])
             offsets.append(-plane[3])
@@ -78,10 +117,11 @@ def bounds(capture: Capture) -> tuple[Float, Float]:
     return low, high
 
 
-def _distance(view: View, field: NDArray[np.float32], points: Float) -> NDArray[np.float32]:
+def _distance(view: View, field: NDArray[np.float32], points: Float, frame_open: bool) -> NDArray[np.float32]:
     """Signed distance of world points (n, 3) to one view's silhouette cone, world units, -inf where the view cannot tell."""
     image, depth = project(view.camera, points)
-    return np.where(depth > 0, beyond_mask(view.camera, field, image) * depth / view.camera.focal_length, np.inf).astype(np.float32)
+    beyond = beyond_mask(view.camera, field, image, frame_open) * depth / view.camera.focal_length
+    return np.where(depth > 0, beyond, np.inf).astype(np.float32)
 
 
 class _Masks:
@@ -89,6 +129,7 @@ class _Masks:
 
     def __init__(self, capture: Capture) -> None:
         self._views = list(zip(capture.views, mask_distances(capture), strict=True))
+        self._frame_open = masks_box(capture).frame_open
 
     def cut(self, points: Float) -> NDArray[np.float32]:
         """The hull's signed distance (n,) at world points (n, 3)."""
@@ -97,7 +138,7 @@ class _Masks:
         def of_part(start: int) -> None:
             part = slice(start, start + POINTS_PER_PART)
             for view, field in self._views:
-                np.maximum(distance[part], _distance(view, field, points[part]), out=distance[part])
+                np.maximum(distance[part], _distance(view, field, points[part], self._frame_open), out=distance[part])
 
         on_cores(of_part, range(0, len(points), POINTS_PER_PART))
         return distance
@@ -122,7 +163,7 @@ def signed_distance(capture: Capture, cells: int) -> SignedDistanceGrid:
 
     A coarse grid over `bounds` finds the hull's own box first. Raises CaptureError where no point is inside all masks.
     """
-    low, high = bounds(capture)
+    low, high, _ = masks_box(capture)
     masks = _Masks(capture)
     coarse = _sample(masks, low, high, min(cells, 32))
     # A cell whose corner is nearer than its diagonal to the hull may hold a part of it.
@@ -182,6 +223,6 @@ def _level_set(grid: SignedDistanceGrid) -> Surface:
 
 def default_cells(capture: Capture) -> int:
     """Cells along the object so that one cell is about two pixels: below that the masks themselves carry no shape."""
-    low, high = bounds(capture)
+    low, high, _ = masks_box(capture)
     pixel = pixel_footprint([view.camera for view in capture.views], (low + high) / 2)
     return int(np.clip(round(float((high - low).max()) / (2 * pixel)), 24, 192))

@@ -96,16 +96,18 @@ def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_R
     return values
 
 
-def beyond_mask(camera: Camera, field: NDArray[np.float32], image: Float) -> NDArray[np.float32]:
+def beyond_mask(camera: Camera, field: NDArray[np.float32], image: Float, frame_open: bool = False) -> NDArray[np.float32]:
     """Signed distance (n,) in pixels of image coordinates (n, 2) to a mask, negative inside; field: its `mask_distance`.
 
-    Beyond the image nothing was photographed: there it is outside, at least by its distance to the image.
+    Beyond the image nothing was photographed: there it is outside, at least by its distance to the image. frame_open: where the image's
+    border cuts the object off nothing is known of what lies beyond, and the distance is -inf.
     """
     pixels = sampled(field, image)
     outside = np.flatnonzero(~inside_image(camera, image))
     limit = np.array([camera.width, camera.height])
     beyond = lengths(np.maximum(np.maximum(-image[outside], image[outside] - limit), 0))
-    pixels[outside] = np.maximum(pixels[outside], 0.5) + beyond
+    cut = frame_open & (pixels[outside] < 0)
+    pixels[outside] = np.where(cut, -np.inf, np.maximum(pixels[outside], 0.5) + beyond)
     return pixels
 
 

@@ -12,7 +12,7 @@ from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps import calibrate
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
-from mvps.hull import bounds, default_cells, hull_of_masks, signed_distance, visual_hull
+from mvps.hull import default_cells, hull_of_masks, masks_box, signed_distance, visual_hull
 from mvps.mesh import normalise, piece_count, vertex_normals
 from mvps.photometric import normal_map
 from mvps.scene import Camera, Capture, CaptureError, Lights, Surface, View
@@ -54,7 +54,7 @@ def discs(views: int, unit: float = 1.0, size: int = 160) -> Capture:
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_hull_of_a_sphere_from_many_sides_is_the_sphere_in_any_unit(unit: float) -> None:
     capture = discs(24, unit)
-    low, high = bounds(capture)
+    low, high, _ = masks_box(capture)
     assert (low < -RADIUS * unit * 0.98).all() and (high > RADIUS * unit * 0.98).all() and (high - low < 3 * RADIUS * unit).all()
     hull = visual_hull(signed_distance(capture, default_cells(capture)))
     radius = np.linalg.norm(hull.vertices, axis=1) / unit
@@ -72,7 +72,7 @@ def test_distance_to_a_straight_mask_is_exact_and_half_a_pixel_from_the_centres(
 
 def test_one_view_bounds_nothing() -> None:
     with pytest.raises(CaptureError, match="leave the object unbounded"):
-        bounds(discs(1))
+        masks_box(discs(1))
 
 
 @pytest.mark.parametrize(("radius", "count"), [(RADIUS / 4, 2), (RADIUS / 16, 1)])

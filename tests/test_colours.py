@@ -12,7 +12,7 @@ from test_shadowed import BOUNCE, DIFFUSE, Seen
 
 from mvps.gleam import patches_of, senders
 from mvps.joint.blocks import Vertices
-from mvps.joint.colours import LobeColour, colours, light_ratios, lobes_in_colour, ratios_of_known
+from mvps.joint.colours import LobeColour, _white, colours, light_ratios, lobes_in_colour, ratios_of_known
 from mvps.joint.grey import grey_lights
 from mvps.joint.observe import channel_ratio, observe
 from mvps.joint.reflectance import Observed
@@ -178,3 +178,16 @@ def test_in_front_of_a_known_object_lights_may_all_be_red(tint: tuple[float, flo
     true = ratios[0] * red
     found = ratios_of_known(of, albedo, np.tile(tint, (len(albedo), 1)), True)[0]
     assert np.abs(found / (true / true.mean(1, keepdims=True)) - 1).mean() < 0.005
+
+
+def test_a_coloured_lamp_among_white_ones_tints_nothing() -> None:
+    """Of lamps that are all coloured the mean is white, as before."""
+    rng = np.random.default_rng(0)
+    white = rng.uniform(0.9, 1.1, (7, 3))
+    red = np.array([[2.9, 0.07, 0.03]])
+    found = _white([np.concatenate([white, red])])[0]
+    np.testing.assert_allclose(found[:7].mean(0), 1, atol=0.01)
+    assert found[7, 0] > 2.5
+    coloured = 0.05 + 2.8 * np.eye(3)[np.arange(8) % 3]
+    tint = coloured.mean(0)
+    np.testing.assert_allclose(_white([coloured])[0], coloured / tint / (coloured / tint).mean(1, keepdims=True))

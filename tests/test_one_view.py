@@ -249,3 +249,14 @@ def test_the_distance_is_the_origins_where_that_is_seen(made: tuple[Capture, Tru
     assert distance_of(view)[0] == pytest.approx(view.camera.translation[2])
     ball = read_capture(captures / "ball", lights={"view_01": [1]}).views[0]
     assert distance_of(ball)[0] == pytest.approx(ball.camera.focal_length)
+
+
+def test_pixels_that_are_wider_than_high() -> None:
+    """Slopes are over rays, not over pixels: lights were 5.1 deg off."""
+    settings = SceneSettings(views=1, lights=12, size=96)
+    scene = make_scene(settings)
+    camera = scene.cameras[0]
+    wide = replace(camera, K=camera.K * np.array([[1.35], [0.9], [1.0]]), width=130)
+    capture, truth = render_capture(settings, replace(scene, cameras=(wide,)))
+    found = reconstruct(capture, Settings("made", preset="draft"), None, Progress())
+    assert angles_deg(found.lights.direction[0], truth.direction["view_01"]).mean() < 2.0

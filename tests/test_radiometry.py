@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mvps.checks.photographs import photographs
-from mvps.checks.radiometry import CURVES, curve_undone, is_metal, left_in, linear
+from mvps.checks.radiometry import CURVES, LINEAR, PIXELS, _rho, curve_undone, is_metal, left_in, linear
 from mvps.load import read_capture
 from mvps.scene import Capture
 from mvps.synthetic.scene import make_scene, render_capture
@@ -84,3 +84,14 @@ def test_few_lights_say_nothing() -> None:
     capture = encoded(made(0), "sRGB", 8)
     few = capture.select({view.name: view.lights[:5] for view in capture.views})
     assert curve_undone(few) == (few, [])
+
+
+def test_pixels_that_few_lamps_light_say_nothing() -> None:
+    """Three factors fit four samples whatever they are: under raking lamps a curve passed for left in."""
+    capture = made(0)
+    views = []
+    for view in capture.views:
+        order = np.argsort(np.argsort(-view.samples.mean(-1), axis=1), axis=1)
+        views.append(replace(view, samples=np.where((order < 4)[..., None], view.samples, 0).astype(np.uint16)))
+    raking = Capture(capture.name, tuple(views))
+    assert left_in(raking) is None and np.isnan([_rho(view, LINEAR, PIXELS) for view in views]).all()

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from sphere_scene import RADIUS, camera_at, make_sphere
 
 from mvps.camera import project, rays
+from mvps.hull import hull_grid, masks_box
 from mvps.joint.agreement import Agreement
 from mvps.joint.refine import POSITION_FLOOR_PIXELS
 from mvps.joint.vertices import with_masks
 from mvps.mesh import normalise, unbiased
-from mvps.scene import Camera, Surface
+from mvps.scene import Camera, Capture, Surface
 from mvps.silhouette import mask_distance, mask_distances, outline, sampled
 from mvps.visibility import RayCaster
 
@@ -105,3 +108,27 @@ def test_unbiased_faces_lie_on_a_ball_in_the_mean() -> None:
     coarse = make_sphere(3).reconstruction.surface
     before, after = RADIUS - mean_radius(coarse), RADIUS - mean_radius(unbiased(coarse))
     assert before > 0.1 and abs(after) < 0.1 * before
+
+
+def cropped(capture: Capture, at: int, rows: int) -> Capture:
+    """The capture, of one view its first rows only."""
+    view = capture.views[at]
+    K = view.camera.K
+    camera = Camera(K, view.camera.rotation, view.camera.translation, rows, view.camera.width)
+    kept = view.pixels[:, 0] < rows
+    part = replace(view, camera=camera, mask=view.mask[:rows], samples=view.samples[kept], frame=None)
+    return Capture(capture.name, tuple(part if k == at else of for k, of in enumerate(capture.views)))
+
+
+def test_a_view_that_cuts_the_object_off_says_nothing_of_the_rest() -> None:
+    """The others enclose it: the hull is no smaller. Where all views cut it off along one side, it ends there."""
+    whole = make_sphere(3).capture
+    rows = whole.views[0].mask.shape[0] // 2
+    one = cropped(whole, 0, rows)
+    volumes = [float((hull_grid(of).values < 0).sum() * hull_grid(of).spacing ** 3) for of in (whole, one)]
+    assert masks_box(one).frame_open and volumes[1] >= 0.99 * volumes[0]
+    every = whole
+    for k in range(len(whole.views)):
+        every = cropped(every, k, rows)
+    assert not masks_box(every).frame_open
+    assert float((hull_grid(every).values < 0).sum() * hull_grid(every).spacing ** 3) < 0.8 * volumes[0]

@@ -23,7 +23,7 @@ import numpy as np
 
 from mvps.checks.coherence import Coherence, Fields, coherence, jacobian, outline_points
 from mvps.cores import on_cores
-from mvps.hull import bounds
+from mvps.hull import masks_box
 from mvps.motions import UNKNOWNS, Object, derivatives, gauge, moved, without_gauge
 from mvps.scene import Camera, Capture, Float
 from mvps.silhouette import STAIRCASE_PIXELS, mask_distances
@@ -124,11 +124,11 @@ class Motions:
 
 
 def outlines_of(capture: Capture, body: Object | None = None) -> Outlines:
-    """The outlines of all masks. body: where the object is, in the masks' bounds if None, with a CaptureError where they enclose none."""
+    """The outlines of all masks. body: where the object is, in the masks' box if None, with a CaptureError where they enclose none."""
     fields = mask_distances(capture)
     points = on_cores(lambda field: outline_points(field, LEAST_SPACING), fields)
     every = -(-sum(len(of_view) for of_view in points) // MOST_POINTS) or 1
-    within = body or Object.between(*bounds(capture))
+    within = body or Object.between(*masks_box(capture)[:2])
     return Outlines(tuple(view.camera for view in capture.views), fields, within, [of_view[::every] for of_view in points])
 
 

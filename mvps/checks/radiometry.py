@@ -59,6 +59,10 @@ FEWEST_LIGHTS = 8
 LIT_SHARE = 0.9
 """Of a pixel's samples: the darkest are shadows."""
 
+FEWEST_KNOWN, KNOWN_SHARE = 6, 0.1
+"""Samples of a pixel that leave three residuals, and the part of the pixels that have so many, from which a view tells: under raking lamps
+most pixels are lit by three to five, which three factors fit whatever they are."""
+
 PIXELS, VIEWS, SWEEPS = 300, 8, 6
 """Looked at: rho is a median of some thousand samples a view."""
 
@@ -78,11 +82,13 @@ def _rho(view: View, curve: Curve, pixels: int) -> float:
     image = over_its_level(curve(codes * view.scale).mean(-1))
     order = np.argsort(np.argsort(over_its_level(codes.mean(-1)), axis=1), axis=1)
     known = (codes < view.saturation).all(-1) & (order >= (1 - LIT_SHARE) * codes.shape[1]) & (codes.min(-1) > 0)
+    # Three factors fit fewer whatever they are.
+    known &= known.sum(1, keepdims=True) >= FEWEST_KNOWN
+    if known.any(1).mean() < KNOWN_SHARE:
+        return float("nan")
     bright = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True), 1e-12)
     M = image / bright
     factors = factorise(M, known, 3, SWEEPS, floor=1e-4)
-    if not known.any():
-        return float("nan")
     left = np.abs(M - factors.left @ factors.right.T)[known]
     return float(np.median(left) / max(float(np.median(np.abs(M - np.median(M, 1, keepdims=True))[known])), 1e-12))
 
@@ -103,6 +109,8 @@ def left_in(capture: Capture) -> tuple[str, float] | None:
     if not some:
         return None
     linear = _log_rho(some, LINEAR)
+    if np.isnan(linear).all():
+        return None
     # The curves are alike: where one of them is no better than none, neither is another.
     if not np.nanmean(linear - _log_rho(some, CURVES["gamma 2.2"])) > 0:
         return None

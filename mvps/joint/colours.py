@@ -70,6 +70,10 @@ ALIKE = 1e-6
 
 TINY = np.finfo(float).tiny
 
+COLOURED = 3.0
+"""Times the median of all lights in a channel, or a part of it, from which a lamp is a coloured one: white ones from 2700 to 6500 K are
+within 2.8 of each other's (Planck's law at 610, 540 and 460 nm over the sum)."""
+
 BY_CHANCE = 3.0
 """Standard deviations that the mean colour of lights which are white on average is from white at most."""
 
@@ -296,8 +300,10 @@ def _ratios(sums: list[tuple[Float, Float]], one_rig: bool) -> list[Float]:
 
 
 def _white(ratios: list[Float]) -> list[Float]:
-    """White on average: a common tint of all lights may be a tint of the object."""
-    tint = np.mean(np.concatenate(ratios), axis=0)
+    """White on average, but for coloured lamps among white ones: a common tint of all lights may be a tint of the object."""
+    every = np.concatenate(ratios)
+    alike = (np.abs(np.log(np.maximum(every, 1e-300) / np.median(every, axis=0))) <= np.log(COLOURED)).all(1)
+    tint = np.mean(every[alike] if 2 * alike.sum() > len(every) else every, axis=0)
     return [_relative(ratio / tint) for ratio in ratios]
 
 

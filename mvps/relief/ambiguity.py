@@ -175,6 +175,8 @@ class _Known:
         blocks = blocks[among[blocks].all((1, 2, 3, 4))]
         centres = pixel_centres(view.pixels)
         ray = np.concatenate([centres, np.ones((len(centres), 1))], 1) @ np.linalg.inv(view.camera.K).T
+        # Of the ray's coordinates over those of the image, in units of the latter's first.
+        self.stretch, self.skew = view.camera.K[1, 1] / view.camera.K[0, 0], view.camera.K[0, 1] / view.camera.K[0, 0]
         self.of_blocks, self.rays = (of[blocks].mean((2, 4)).reshape(-1, 4, 3) for of in (pseudo.left, ray))
         self.size = np.maximum(np.linalg.norm(self.of_blocks, axis=2).mean(1) ** 2, 1e-300)
         pairs = generator.integers(0, len(among), (2, PAIRS))
@@ -196,6 +198,7 @@ class _Known:
         middle = h.mean(1)
         right = (h[:, 1] + h[:, 3] - h[:, 0] - h[:, 2]) / 2
         down = (h[:, 2] + h[:, 3] - h[:, 0] - h[:, 1]) / 2
+        down = self.stretch * down + self.skew * right
         along_y = middle[:, 2] * down[:, 0] - middle[:, 0] * down[:, 2]
         along_x = middle[:, 2] * right[:, 1] - middle[:, 1] * right[:, 2]
         curl: Float = (along_y - along_x) / self.size

@@ -12,6 +12,7 @@ Data, one array after the other, compressed by deflate (RFC 1950), written in ba
 
     position  (V, 3) uint16   over the box from low to high        normal  (V, 3) int16 over 32767
     albedo    (V, 3) uint8    square root, over `white`            weight  (V, 4) uint8 square root, over `lobe_white`, 0 beyond the lobes
+    hue       (V, 3) uint8    square root, over `hue_white`, times the lobes' colours of the object in the mean
     confidence  (V,) uint8                                         faces   (F, 3) uint32
 """
 
