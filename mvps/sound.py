@@ -43,10 +43,11 @@ def sound(capture: Capture, progress: Progress, held: Sequence[int] = (), one_ri
     known not to be so, photographs are not held against other views' of the same number.
     """
     apart = {view.name for view in capture.views if int(view.name[5:]) in held}
-    rest = Capture(capture.name, tuple(view for view in capture.views if view.name not in apart)) if apart else capture
-    mended, findings = _sound(rest, progress, one_rig)
-    if not apart:
-        return mended, findings
+    rest = tuple(view for view in capture.views if view.name not in apart)
+    # Shown by themselves, views that are kept back have no others to stay out of.
+    if not apart or not rest:
+        return _sound(capture, progress, one_rig)
+    mended, findings = _sound(Capture(capture.name, rest), progress, one_rig)
     whole, of_all = _sound(capture, progress, one_rig)
     after = {view.name: view for view in whole.views if view.name in apart} | {view.name: view for view in mended.views}
     kept = [after.get(view.name, view) for view in capture.views if view.name in apart or view.name in after]

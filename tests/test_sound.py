@@ -104,6 +104,11 @@ def test_a_view_that_would_be_left_out_may_be_kept_back(made: Capture) -> None:
     assert [(one.where, one.mended) for one in findings] == [(upright.name, True)] and findings[0].text.startswith("kept back: ")
 
 
+def test_views_that_are_all_kept_back_are_mended_as_any(made: Capture) -> None:
+    every = [int(view.name[5:]) for view in made.views]
+    assert sound(made, Progress(), every) == sound(made, Progress())
+
+
 def test_lights_that_are_known_to_differ_are_not_held_against_each_other(made: Capture) -> None:
     """Two photographs that a view names the other way round: a fault under one rig, none where its lights were given so."""
     samples = made.views[2].samples.copy()
