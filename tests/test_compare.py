@@ -21,7 +21,7 @@ from mvps.compare.__main__ import main
 from mvps.compare.curve import Point, dominated, drawings, points_of, ticks
 from mvps.compare.page import page_html
 from mvps.compare.pictures import cropped, error_picture
-from mvps.compare.running import Run, known_runs
+from mvps.compare.running import Run, known_runs, state
 from mvps.compare.tables import as_csv, as_markdown, as_text, otherwise_rows, protocol_rows, rows
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
@@ -209,3 +209,11 @@ def test_curve_joins_our_budgets_and_names_all() -> None:
     assert dominated(points_of(runs, "chamfer_px")) == {"hull": False}
     assert dominated([Point(60, 0.1, "slow"), *points_of(runs, "chamfer_px")]) == {"slow": True, "hull": False}
     assert ticks(0.9, 6) == [1, 2, 5]
+
+
+def test_a_run_is_of_the_files_that_it_was_made_from(tmp_path: Path) -> None:
+    (tmp_path / "001.png").write_bytes(b"one")
+    first = state(tmp_path)
+    assert state(tmp_path) == first
+    (tmp_path / "001.png").write_bytes(b"other")
+    assert state(tmp_path) != first

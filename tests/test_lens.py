@@ -36,8 +36,13 @@ def through_lens(capture: Capture, pixels: float) -> Capture:
     return damage.lens(capture, pixels, np.random.default_rng(0))
 
 
-def test_the_two_maps_are_inverse_to_each_other() -> None:
-    camera = Camera(np.array([[150.0, 0, 40], [0, 160, 30], [0, 0, 1]]), np.eye(3), np.zeros(3), 60, 80, BENT)
+@pytest.mark.parametrize("skew", [0.0, 12.0])
+def test_the_two_maps_are_inverse_to_each_other(skew: float) -> None:
+    K = np.array([[150.0, skew, 40], [0, 160, 30], [0, 0, 1]])
+    column, row = seen_at(Camera(K, np.eye(3), np.zeros(3), 60, 80, (1e-9, 0, 0, 0, 0)))
+    np.testing.assert_allclose(column, np.broadcast_to(np.arange(80), column.shape), atol=1e-3)
+    np.testing.assert_allclose(row, np.broadcast_to(np.arange(60)[:, None], row.shape), atol=1e-3)
+    camera = Camera(K, np.eye(3), np.zeros(3), 60, 80, BENT)
     column, row = seen_at(camera)
     seen = np.stack([column, row], -1).reshape(-1, 2) + 0.5
     straight = np.stack(np.meshgrid(np.arange(80), np.arange(60)), -1).reshape(-1, 2) + 0.5

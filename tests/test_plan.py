@@ -69,6 +69,19 @@ def test_given_lights_stay_with_their_colours(views: int) -> None:
 BEFORE = [{"goes_on": 0.3}]
 
 
+def test_given_lights_are_those_of_photographs_that_are_kept_back() -> None:
+    """In other colours than the others', so that no rig nor fit would tell them."""
+    capture, truth = render_capture(SceneSettings(views=5, lights=10, size=80))
+    intensity = list(truth.intensity.values())
+    intensity[3] = intensity[3] * [2.0, 1.0, 0.5]
+    given = Lights(tuple(truth.direction.values()), tuple(intensity), False)
+    settings = Settings("made", preset="draft", hold_out_views=(4,), hold_out_lights=(2,), calibrated_lights=True)
+    made = reconstruct(capture, settings, given, Progress()).lights
+    scale = np.concatenate(made.intensity) / np.concatenate(given.intensity)
+    np.testing.assert_allclose(scale, scale.mean(), rtol=1e-5)
+    np.testing.assert_allclose(np.concatenate(made.direction), np.concatenate(given.direction), atol=1e-6)
+
+
 def test_colours_are_given_with_the_lights() -> None:
     for free in (True, False):
         for plan in (first_pass(free, True), carving_pass(free), last_pass("standard", free, False, BEFORE)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import trimesh
 from tiny_capture import HEIGHT, VIEWS, WIDTH, mask, rotation, tiny_capture
 
 from mvps.load import read_calibrated_lights, read_capture, read_truth
-from mvps.scene import CaptureError
+from mvps.scene import Capture, CaptureError
 
 
 @pytest.fixture
@@ -122,3 +123,21 @@ def test_complaints_about_calibrated_lights(with_truth: Path) -> None:
     (with_truth / "view_02" / "light_directions.txt").unlink()
     with pytest.raises(CaptureError, match=r"light_directions.txt: wanted three numbers per light, given no such file"):
         read_calibrated_lights(with_truth, capture)
+
+
+def test_truth_and_given_lights_turn_with_a_camera_that_was_turned(with_truth: Path) -> None:
+    capture = read_capture(with_truth)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    views = [replace(v, camera=replace(v.camera, rotation=v.camera.rotation @ turn.T)) for v in capture.views]
+    before, after = read_truth(with_truth), read_truth(with_truth, {v.name: v.camera for v in views})
+    given = read_calibrated_lights(with_truth, Capture(capture.name, tuple(views)))
+    assert given.one_rig
+    for k, name in enumerate(before.views):
+        np.testing.assert_allclose(after.direction[name], before.direction[name] @ turn.T, atol=1e-12)
+        np.testing.assert_allclose(given.direction[k], after.direction[name], atol=1e-12)
+
+
+def test_fewer_intensities_than_directions(with_truth: Path) -> None:
+    np.savetxt(with_truth / "view_02" / "light_intensities.txt", [[1, 2, 3]])
+    with pytest.raises(CaptureError, match=r"wanted 3 lines, as light_directions\.txt has, given 1"):
+        read_truth(with_truth)
