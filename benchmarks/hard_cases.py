@@ -28,7 +28,6 @@ import cv2
 import numpy as np
 from accuracy import COLUMNS, HERE, machine, ran, table
 from hard.cases import CASES, OF_THE_MADE_OBJECT, Sample, by_chance
-from hard.damage import background
 from hard.scenes import BASE
 
 from mvps.synthetic.files import write_capture
@@ -43,17 +42,18 @@ Row = dict[str, Any]
 
 def photographed_outside(sample: Sample, given: Path) -> None:
     """Puts what cameras saw outside masks into the given capture's photographs: the part of the object that masks lack, for a wrong mask
-    takes nothing away from photographs, and a bright wall. Only where the view's place and size are still those of the unharmed one."""
+    takes nothing away from photographs, and what stands behind it. Only where the view's place and size are still those of the
+    unharmed one."""
     for before, after in zip(sample.good.views, sample.given.views, strict=False):
         lost = before.mask & ~after.mask if before.mask.shape == after.mask.shape else np.zeros(1, bool)
-        if not (lost.any() or sample.bright) or before.name != after.name or before.lights != after.lights:
+        if not (lost.any() or sample.behind) or before.name != after.name or before.lights != after.lights:
             continue
         for k, light in enumerate(after.lights):
             path = given / after.name / f"{light:03d}.png"
             image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
             image[lost] = before.samples[before.pixel_index[lost], k, ::-1]
-            if sample.bright:
-                image[~before.mask & ~after.mask] = background(before)[k, ::-1]
+            if sample.behind:
+                image[~before.mask & ~after.mask] = sample.behind(before)[k, ::-1]
             cv2.imwrite(str(path), image)
 
 

@@ -82,8 +82,9 @@ def gather(surface: Surface, size: float, sheltered: float) -> Gather:
     rows, faces, along = _met(caster, vertex)
     if sheltered < size:
         met = np.bincount(rows, minlength=len(vertex)) / RAYS
-        vertex, patch = _cut(surface, normals, np.where(met[patch] < SHELTERED, size, sheltered))
-        rows, faces, along = _met(caster, vertex)
+        smaller, patch = _cut(surface, normals, np.where(met[patch] < SHELTERED, size, sheltered))
+        rows, faces, along = _met_again(caster, smaller, vertex, (rows, faces, along))
+        vertex = smaller
     normal, columns = normals[vertex], patch[surface.faces[faces, 0]]
     S = sp.csr_matrix((np.full(len(rows), 1 / RAYS, np.float32), (rows, columns)), (len(vertex), len(vertex)))
     spread = np.bincount(patch, ((normals - normal[patch]) ** 2).sum(1) / 2) / np.bincount(patch)
@@ -116,8 +117,23 @@ def _met(caster: RayCaster, vertex: Int) -> tuple[Int, Int, NDArray[np.float32]]
         seen = seen[(facing[hits.face[seen]] * directions[seen]).sum(1) < 0]
         return first + seen // RAYS, hits.face[seen], directions[seen].astype(np.float32)
 
-    rows, faces, along = (np.concatenate(parts) for parts in zip(*map(met, range(0, len(vertex), PATCHES_AT_ONCE)), strict=True))
+    rows, faces, along = (np.concatenate(parts) for parts in zip(*map(met, range(0, max(len(vertex), 1), PATCHES_AT_ONCE)), strict=True))
     return rows, faces, along
+
+
+def _met_again(
+    caster: RayCaster, vertex: Int, before: Int, met: tuple[Int, Int, NDArray[np.float32]]
+) -> tuple[Int, Int, NDArray[np.float32]]:
+    """`_met` of vertices (n,), some of which are among others (m,) whose rays met what `met` says."""
+    place = np.full(len(caster.surface.vertices), -1)
+    place[vertex] = np.arange(len(vertex))
+    kept = np.flatnonzero(place[before][met[0]] >= 0)
+    known, new = [of[kept] for of in met], np.flatnonzero(~np.isin(vertex, before))
+    known[0] = place[before][known[0]]
+    started, *others = _met(caster, vertex[new])
+    rows, faces, along = (np.concatenate(both) for both in zip(known, (new[started], *others), strict=True))
+    order = np.argsort(rows, kind="stable")
+    return rows[order], faces[order], along[order]
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,10 +232,12 @@ def interpolation(of: Gather, points: Float, normal: Float) -> sp.csr_matrix:
     """(points, n) weights of the patches at points with normals (points, 3): inverse squared distance, facing the same way."""
     distance, index = neighbours(of.tree, points, NEIGHBOURS)
     near = 1e-3 * float(np.median(distance)) + 1e-300
-    weight = np.maximum((normal[:, None] * of.normal[index]).sum(-1), 0.05) / np.maximum(distance, near) ** 2
+    # Axis by axis: numpy's loops are slow along an axis of three.
+    facing = sum(normal[:, k, None] * np.take(of.normal[:, k], index) for k in range(3))
+    weight = np.maximum(facing, 0.05) / np.maximum(distance, near) ** 2
     weight /= weight.sum(1, keepdims=True)
-    rows = np.repeat(np.arange(len(points)), NEIGHBOURS)
-    return sp.csr_matrix((weight.astype(np.float32).ravel(), (rows, index.ravel())), (len(points), len(of.normal)))
+    ends = np.arange(0, index.size + 1, NEIGHBOURS)
+    return sp.csr_matrix((weight.astype(np.float32).ravel(), index.ravel(), ends), (len(points), len(of.normal))).sorted_indices()
 
 
 @once_for

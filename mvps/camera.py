@@ -21,10 +21,15 @@ DILIGENT_FROM_CAMERA = np.diag([1.0, -1.0, -1.0])
 
 def project(camera: Camera, points: Float) -> tuple[Float, Float]:
     """Image coordinates (..., 2) in pixels and depth (...,) of world points (..., 3)."""
-    local = points @ camera.rotation.T + camera.translation
-    depth = local[..., 2]
-    image = local @ camera.K.T
-    return image[..., :2] / image[..., 2:], depth
+    local = points @ camera.rotation.T
+    # Column by column: numpy's loops are slow along an axis of two or three.
+    for k in range(3):
+        local[..., k] += camera.translation[k]
+    homogeneous = local @ camera.K.T
+    image = np.empty_like(homogeneous[..., :2])
+    for k in range(2):
+        np.divide(homogeneous[..., k], homogeneous[..., 2], out=image[..., k])
+    return image, local[..., 2]
 
 
 def rays(camera: Camera, image: Float) -> tuple[Float, Float]:
@@ -42,7 +47,10 @@ def pixel_centres(pixels: Int) -> Float:
 
 def view_directions(camera: Camera, points: Float) -> Float:
     """Unit vectors (..., 3), world frame, from points towards the camera."""
-    return normalise(camera.centre - points)
+    towards = np.empty_like(points, float)
+    for k in range(3):
+        np.subtract(camera.centre[k], points[..., k], out=towards[..., k])
+    return normalise(towards)
 
 
 def footprint(camera: Camera, points: Float) -> Float:
@@ -68,7 +76,8 @@ def rig_frame(lights: Lights, camera: Camera) -> Float:
 
 def inside_image(camera: Camera, image: Float) -> Bool:
     """(...,) True where image coordinates (..., 2) lie on the image."""
-    inside: Bool = (image >= 0).all(-1) & (image[..., 0] < camera.width) & (image[..., 1] < camera.height)
+    x, y = image[..., 0], image[..., 1]
+    inside: Bool = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     return inside
 
 
@@ -86,13 +95,16 @@ def bilinear(index: Int, image: Float) -> tuple[NDArray[np.int32], NDArray[np.fl
     positions = np.empty((len(image), 4), np.int32)
     weights = np.empty((len(image), 4), np.float32)
     corners: list[tuple[int, int, Any]] = [(0, 0, (1 - fy) * (1 - fx)), (0, 1, (1 - fy) * fx), (1, 0, fy * (1 - fx)), (1, 1, fy * fx)]
+    # Two rows and columns of background around the image stand for all that lies beyond it.
+    framed = np.pad(index, 2, constant_values=-1).ravel()
+    first = (np.clip(row, -2, height) + 2) * (width + 4) + np.clip(column, -2, width) + 2
     for k, (dr, dc, weight) in enumerate(corners):
-        r, c = row + dr, column + dc
-        on = (r >= 0) & (r < height) & (c >= 0) & (c < width)
-        position = np.where(on, index[np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)], -1)
+        position = np.take(framed, first + (dr * (width + 4) + dc))
         positions[:, k] = np.maximum(position, 0)
         weights[:, k] = np.where(position >= 0, weight, 0)
-    total = weights.sum(1, keepdims=True)
-    np.divide(weights, total, out=weights, where=total > 1e-6)
-    weights[total[:, 0] <= 1e-6] = 0
+    total = weights[:, 0] + weights[:, 1] + weights[:, 2] + weights[:, 3]
+    known = total > 1e-6
+    for weight in weights.T:
+        np.divide(weight, total, out=weight, where=known)
+    weights[~known] = 0
     return positions, weights

@@ -22,8 +22,14 @@ two at best."""
 
 def face_cross(surface: Surface) -> Float:
     """(F, 3) cross product of two edges of every face: outward normal times twice the area."""
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    a, b, c = corners(surface)
     return cross(b - a, c - a)
+
+
+def corners(surface: Surface) -> list[Float]:
+    """The faces' first, second and third corners, (F, 3) each."""
+    # Several times faster than numpy's indexing by rows.
+    return [np.take(surface.vertices, surface.faces[:, k], axis=0) for k in range(3)]
 
 
 def cross(a: Float, b: Float) -> Float:
@@ -34,8 +40,18 @@ def cross(a: Float, b: Float) -> Float:
 
 def normalise(vectors: Float, floor: float = 1e-300) -> Float:
     """Vectors (..., 3) divided by their length; a zero vector stays zero."""
-    unit: Float = vectors / np.maximum(lengths(vectors), floor)[..., None]
+    length = np.maximum(lengths(vectors), floor)
+    unit: Float = np.empty_like(vectors, np.result_type(vectors, length))
+    # Numpy's loops are slow along an axis of three.
+    for k in range(vectors.shape[-1]):
+        np.divide(vectors[..., k], length, out=unit[..., k])
     return unit
+
+
+def dot(a: Float, b: Float) -> Float:
+    """(...,) products of vectors a and b (..., 3); several times faster than a sum along an axis of three."""
+    product: Float = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return product
 
 
 def lengths(vectors: Float) -> Float:
@@ -49,6 +65,13 @@ def angles_deg(a: Float, b: Float) -> Float:
     chord, sum_ = lengths(a - b), lengths(a + b)
     angle: Float = np.degrees(2 * np.arctan2(chord, sum_))
     return angle
+
+
+def centres(surface: Surface) -> Float:
+    """(F, 3) of the faces."""
+    a, b, c = corners(surface)
+    centre: Float = (a + b + c) / 3
+    return centre
 
 
 @once_for
@@ -76,8 +99,8 @@ def vertex_areas(surface: Surface) -> Float:
 def vertex_normals(surface: Surface) -> Float:
     """(V, 3) unit outward normals: face normals weighted by the angle at the vertex (Thuermer and Wuethrich 1998). Read-only, made once
     for a surface, like others here."""
-    corners = [surface.vertices[surface.faces[:, k]] for k in range(3)]
-    sides = [corners[(k + 1) % 3] - corners[k] for k in range(3)]
+    ends = corners(surface)
+    sides = [ends[(k + 1) % 3] - ends[k] for k in range(3)]
     outward = cross(sides[0], sides[1])
     doubled = lengths(outward)
     normals = normalise(outward)
@@ -129,8 +152,8 @@ def edge_numbers(faces: Int, n: int) -> Int:
 @once_for
 def mean_edge_length(surface: Surface) -> float:
     """Mean length of the faces' sides: of the edges, those at a border counting half."""
-    corners = surface.vertices[surface.faces]
-    return float(lengths(corners - corners[:, [1, 2, 0]]).mean())
+    a, b, c = corners(surface)
+    return float(np.stack([lengths(a - b), lengths(b - c), lengths(c - a)], 1).mean())
 
 
 def without_unused_vertices(surface: Surface) -> Surface:

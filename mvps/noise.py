@@ -11,6 +11,7 @@ import numpy as np
 from mvps.cores import on_cores
 from mvps.once import once_for
 from mvps.scene import Capture, View
+from mvps.values import channel_mean
 
 INTERPOLATED = 2 / 3
 """Part of the pixels' noise that is left between four of them, root mean square over all places."""
@@ -47,7 +48,7 @@ def _shares(view: View, part: float) -> list[float]:
         if not view.usable([k]).any():
             continue
         image = np.full(view.mask.shape, np.nan)
-        image[view.mask] = np.where(view.usable([k])[:, 0], view.samples[:, k].mean(1), np.nan)
+        image[view.mask] = np.where(view.usable([k])[:, 0], channel_mean(view.samples[:, k]), np.nan)
         second = image[:, :-2] - 2 * image[:, 1:-1] + image[:, 2:]
         around = image[:, :-2] + image[:, 1:-1] + image[:, 2:]
         known = np.isfinite(second)

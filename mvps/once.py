@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from functools import cached_property, wraps
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar, overload
-from weakref import WeakKeyDictionary
+from weakref import finalize
 
 import numpy as np
 
@@ -36,13 +36,16 @@ def once_for(function: Callable[Concatenate[Thing, Rest], Result]) -> Callable[C
     """function(thing, rest), made once for a thing and each rest, and kept as long as the thing lives; things and rests are told apart by
     what they are, not by what they hold. Arrays are read-only, for all who ask get the same. Threads that ask for the same at the same time
     may each make it, and get what was made first."""
-    kept: WeakKeyDictionary[Any, dict[Any, Result]] = WeakKeyDictionary()
+    kept: dict[int, dict[Any, Result]] = {}
     lock = threading.Lock()
 
     @wraps(function)
     def once(thing: Thing, /, *rest: Rest.args, **named: Rest.kwargs) -> Result:
         with lock:
-            of_thing = kept.setdefault(thing, {})
+            if id(thing) not in kept:
+                kept[id(thing)] = {}
+                finalize(thing, kept.pop, id(thing)).atexit = False
+            of_thing = kept[id(thing)]
         key = (rest, *sorted(named.items()))
         if key not in of_thing:
             made = function(thing, *rest, **named)

@@ -88,18 +88,21 @@ def normal_pictures(capture: Capture, used: Capture, refined: Refined) -> tuple[
 
     from mvps.cores import on_cores
     from mvps.joint.pixels import filled
-    from mvps.rendering import points_under
-    from mvps.visibility import ray_caster
+    from mvps.mesh import normalise
+    from mvps.visibility import interpolate, ray_caster, view_hits
 
     caster = ray_caster(refined.surface)
     own = {view.name: maps for view, maps in zip(used.views, refined.maps, strict=True)}
+    # What a view's pixels hit is kept for the view: the verdict asks for those that were used.
+    same = {view.name: view for view in used.views}
 
     def one(view: View) -> Any:
-        points = points_under(caster, refined.material, view.camera, view.pixels)
-        normal = filled(view, own[view.name], points.normal) if view.name in own else points.normal
+        hits = view_hits(caster, same.get(view.name, view))
+        normal, hit = normalise(interpolate(refined.surface, hits, refined.material.normal)), hits.face >= 0
+        normal = filled(view, own[view.name], normal) if view.name in own else normal
         picture = np.full((*view.mask.shape, 3), np.nan, np.float32)
-        picture[view.mask] = np.where(points.hit[:, None], normal, np.nan)
-        if points.hit.any():
+        picture[view.mask] = np.where(hit[:, None], normal, np.nan)
+        if hit.any():
             nearest = distance_transform_edt(np.isnan(picture[..., 0]), return_distances=False, return_indices=True)
             picture = picture[tuple(nearest)]
         picture[~view.mask] = np.nan

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mvps.mesh import normalise
 from mvps.scene import Bool, Capture, CaptureError, Float, View
 from mvps.sharing import Frame
+from mvps.values import channel_mean
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate
 
 PIXELS_PER_VIEW = 1000
@@ -73,10 +74,10 @@ def pixel_samples(view: View, caster: RayCaster, normal: Float, generator: np.ra
             " check this view's rotation, translation and mask, or leave it out with --views"
         )
     chosen, hits = chosen[on], Hits(hits.face[on], hits.barycentric[on], hits.distance[on])
-    image = view.samples[chosen].astype(np.float64).mean(-1) * view.scale
+    image = channel_mean(view.samples[chosen]) * view.scale
     bright = np.quantile(image if view.shown.all() else image[:, view.shown], BRIGHT_QUANTILE, axis=1, keepdims=True)
     bright = np.maximum(bright, view.scale)
-    known = (view.samples[chosen] < view.saturation).all(-1) & (image > SHADOWED * bright)
+    known = view.usable()[chosen] & (image > SHADOWED * bright)
     seen = normalise(interpolate(caster.surface, hits, normal)) @ view.camera.rotation.T
     shown = np.broadcast_to(view.shown, image.shape)
     return PixelSamples(image / bright, bright[:, 0], known, seen, view.scale / float(np.median(bright)), shown)

@@ -6,6 +6,7 @@ capture -> visual hull -> lights -> photometric stereo of every view -> Stage I:
 
 from __future__ import annotations
 
+import gc
 import sys
 from argparse import ArgumentTypeError
 from collections.abc import Callable, Mapping, Sequence
@@ -214,8 +215,14 @@ def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Ligh
 
 def load_libraries() -> None:
     """What the stages are made of: 2 s on one core, while photographs are decoded outside the interpreter's lock."""
-    for name in ("mvps.joint.refine", "mvps.report", "mvps.sound", "mvps.texture", "gpytoolbox", "gpytoolbox_bindings"):
-        import_module(name)
+    # Of libraries nothing ever is garbage, for which all of their half a million objects would be looked through again and again.
+    gc.disable()
+    try:
+        for name in ("mvps.joint.refine", "mvps.report", "mvps.sound", "mvps.texture", "gpytoolbox", "gpytoolbox_bindings"):
+            import_module(name)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def face_counts(text: str) -> tuple[int, ...]:

@@ -11,6 +11,7 @@ The shading normal is the material's refined normal; shadows are traced on the m
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -24,7 +25,7 @@ from mvps.mesh import normalise
 from mvps.neural import factor
 from mvps.scene import Bool, Camera, Float, Int, Law, Material, Surface
 from mvps.shading import shade
-from mvps.visibility import RayCaster, camera_hits, interpolate, shadows
+from mvps.visibility import RayCaster, camera_hits, interpolate_all, shadows
 
 SAMPLES_PER_CHUNK = 1 << 18
 
@@ -65,11 +66,10 @@ def points_under(caster: RayCaster, material: Material, camera: Camera, pixels: 
     surface = caster.surface
     hits = camera_hits(caster, camera, pixels)
     values = (surface.vertices, caster.vertex_normals, material.normal, material.albedo, material.specular_weight, material.confidence)
-    position, mesh_normal, normal, albedo, weight, confidence = (interpolate(surface, hits, v) for v in values)
     residual = material.residual
     nothing: Float = np.zeros((len(material.albedo), 0))
-    of_vertices = (nothing, nothing) if residual is None else (residual.share, residual.code)
-    share, code = (interpolate(surface, hits, v) for v in of_vertices)
+    of_residual = (nothing, nothing) if residual is None else (residual.share, residual.code)
+    position, mesh_normal, normal, albedo, weight, confidence, share, code = interpolate_all(surface, hits, *values, *of_residual)
     return Points(position, normalise(mesh_normal), normalise(normal), albedo, weight, confidence, hits.face >= 0, share, code)
 
 
@@ -167,30 +167,56 @@ def photograph(
 
     arriving: inter-reflection under the same lights, for the same camera.
     """
-    fine, rays = within_pixels(camera, pixels, side)
     image = np.zeros((len(pixels), len(direction), 3), np.float32)
-    for of_rays in rays:
-        _add_rays(image, points_under(caster, material, fine, of_rays), caster, material, fine, direction, arriving)
+    for rays in _lit_rays(caster, material, camera, pixels, direction, side):
+        _add_rays(image, rays, material, direction, arriving)
     return image * (intensity / side**2).astype(np.float32)
 
 
-def _add_rays(
-    image: NDArray[np.float32],
-    points: Points,
+def photograph_and_gloss(
     caster: RayCaster,
     material: Material,
     camera: Camera,
+    pixels: Int,
     direction: Float,
+    intensity: Float,
     arriving: Arriving | None,
-) -> None:
-    """Adds to an image (n, lights, 3) what points show under lights of unit intensity."""
-    view = view_directions(camera, points.position)
-    lit = ~shadow_at(caster, material.law, points, direction)
+    side: int,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """`photograph`, and the part of it that lobes alone send straight from the lights."""
+    image, gloss = np.zeros((2, len(pixels), len(direction), 3), np.float32)
+    for rays in _lit_rays(caster, material, camera, pixels, direction, side):
+        _add_rays(image, rays, material, direction, arriving)
+        black = rays.points._replace(albedo=np.zeros_like(rays.points.albedo))
+        _add_rays(gloss, rays._replace(points=black), material, direction, None)
+    strength = (intensity / side**2).astype(np.float32)
+    return image * strength, gloss * strength
+
+
+class _Rays(NamedTuple):
+    """One ray through each of n pixels: what it meets; view (n, 3) towards the camera; lit (n, lights) where no shadow is cast."""
+
+    points: Points
+    view: Float
+    lit: Bool
+
+
+def _lit_rays(caster: RayCaster, material: Material, camera: Camera, pixels: Int, direction: Float, side: int) -> Iterator[_Rays]:
+    """side^2 rays through each of the pixels (n, 2), under lights direction (lights, 3)."""
+    fine, rays = within_pixels(camera, pixels, side)
+    for of_rays in rays:
+        points = points_under(caster, material, fine, of_rays)
+        lit = ~shadow_at(caster, material.law, points, direction)
+        yield _Rays(points, view_directions(fine, points.position), lit)
+
+
+def _add_rays(image: NDArray[np.float32], rays: _Rays, material: Material, direction: Float, arriving: Arriving | None) -> None:
+    """Adds to an image (n, lights, 3) what rays bring under lights of unit intensity."""
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(image), step):
         part = slice(start, start + step)
-        of_part = points.part(part)
-        image[part] += shaded(of_part, view[part], material, direction) * lit[part, :, None]
+        of_part = rays.points.part(part)
+        image[part] += shaded(of_part, rays.view[part], material, direction) * rays.lit[part, :, None]
         if arriving is not None:
             of_albedo, of_lobes = arriving.at(of_part)
             image[part] += of_part.albedo[:, None].astype(np.float32) * of_albedo + of_lobes

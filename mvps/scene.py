@@ -45,7 +45,7 @@ class CaptureError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera: K (3, 3) pixels; rotation (3, 3), translation (3,) camera_from_world; a lens's k1 to k5 are for checks/lens.py."""
+    """A pinhole camera: K (3, 3) pixels; rotation (3, 3), translation (3,) camera_from_world; a lens's k1 to k5 are for distortion.py."""
 
     K: Float
     rotation: Float
@@ -90,6 +90,7 @@ class View:
     lights      numbers of the photographs' lights, counted from 1 as in the files
     frame       (height, width) mean code value of every pixel over lights and channels, the background's too; None where not known
     files       the photographs, in the order of `lights`; none where they were not read from files
+    black       code value that was taken off the files', for each channel
     """
 
     name: str
@@ -101,6 +102,7 @@ class View:
     lights: tuple[int, ...]
     frame: NDArray[np.float32] | None = None
     files: tuple[Path, ...] = ()
+    black: tuple[int, int, int] = (0, 0, 0)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mask", checked("mask", self.mask, (self.camera.height, self.camera.width), bool))
@@ -157,8 +159,7 @@ class Lights:
 
     direction  per view (lights, 3) unit, world frame, from the surface towards the light
     intensity  per view (lights, 3) RGB, positive, relative
-    one_rig    all views are under the same lights, which stand still in the camera's frame: rotation_i @ direction_i is the same for
-               all views i
+    one_rig    all views are under the same lights, which stand still in the camera's frame: rotation_i @ direction_i is all views'
     fixed      one rig that stands still in the world instead, while the camera moves: direction_i is the same for all views i
     """
 
@@ -225,10 +226,9 @@ confidence = 1 / (1 + (sigma / RELIABLE)^2) with sigma the standard deviation al
 
 
 def expected_error_deg(confidence: Float) -> Float:
-    """Mean error, degrees, of normals with this confidence (n,): sqrt(pi / 2) times the standard deviation along a tangent, 90 at
-    most: more is no error of a direction that a camera sees."""
+    """Mean error, degrees, of normals with this confidence (n,): sqrt(pi / 2) times the standard deviation along a tangent."""
     error: Float = np.degrees(np.sqrt(np.pi / 2) * RELIABLE * np.sqrt(1 / np.clip(confidence, 1e-12, 1.0) - 1))
-    return error.clip(max=90.0)
+    return error.clip(max=90.0)  # Of a direction that a camera sees.
 
 
 def less_confident(confidence: Float, variance: Float) -> Float:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mvps.camera import project
 from mvps.cores import on_cores
 from mvps.scene import Bool, Capture, Float, Int, View
+from mvps.values import channel_mean
 from mvps.visibility import RayCaster, visible_vertices
 from solvers.low_rank import robust_weights, solve_rows
 
@@ -62,10 +63,9 @@ def _of_view(view: View, number: int, caster: RayCaster, among: Int, most: int) 
     pixel = view.pixel_index[row, column]
     chosen, pixel = chosen[pixel >= 0], pixel[pixel >= 0]
     lights = slice(None, None, max(1, len(view.lights) // most))
-    samples = view.samples[pixel][:, lights]
-    values = samples.astype(np.float64).mean(-1) * view.scale
+    values = channel_mean(view.samples[pixel][:, lights]) * view.scale
     bright = np.quantile(values, BRIGHT, axis=0) if len(values) else 0.0
-    known = (samples < view.saturation).all(-1) & (values > DARK * bright)
+    known = view.usable(lights)[pixel] & (values > DARK * bright)
     normal = caster.vertex_normals[chosen]
     return VertexSamples(
         np.searchsorted(among, chosen), np.full(len(chosen), number), normal, normal @ view.camera.rotation.T, values, known

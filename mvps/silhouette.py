@@ -34,7 +34,7 @@ from mvps.camera import footprint, inside_image, project, rays
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise
 from mvps.once import once_for
-from mvps.scene import Bool, Camera, Capture, Float, Int, View
+from mvps.scene import Bool, Camera, Capture, Float, Int
 from mvps.visibility import RayCaster
 
 STAIRCASE_PIXELS = 1.0
@@ -65,6 +65,7 @@ class Outline:
     rate: Float
 
 
+@once_for
 def mask_distance(mask: Bool) -> NDArray[np.float32]:
     """(height, width) signed distance in pixels from pixel centres to the mask's boundary, negative inside."""
     # scipy rather than OpenCV, whose blur and distance differ in the last bits from call to call.
@@ -74,25 +75,24 @@ def mask_distance(mask: Bool) -> NDArray[np.float32]:
     return smooth
 
 
-@once_for
-def _of_view(view: View) -> NDArray[np.float32]:
-    """`mask_distance` of a view."""
-    return mask_distance(view.mask)
-
-
 def mask_distances(capture: Capture) -> list[NDArray[np.float32]]:
-    """`mask_distance` of every view, made once for a view, on all cores."""
-    return on_cores(_of_view, capture.views)
+    """`mask_distance` of every view, made once for a mask, on all cores."""
+    return on_cores(lambda view: mask_distance(view.mask), capture.views)
 
 
 def sampled(field: NDArray[np.float32], image: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:
     """Bilinear values (n[, channels]) of a field (height, width[, channels]) at image coordinates (n, 2) (OpenCV before 5 rounds these to a
     32nd of a pixel); beyond the border its nearest value, or 0 with cv2.BORDER_CONSTANT."""
-    at = image.astype(np.float32) - np.float32(0.5)
-    values = np.empty((len(at), *field.shape[2:]), np.float32)
-    for start in range(0, len(at), REMAP_LIMIT):
-        part = at[None, start : start + REMAP_LIMIT]
-        values[start : start + part.shape[1]] = cv2.remap(field, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=border)[0]
+    return sampled_at(field, image[:, 0], image[:, 1], border)
+
+
+def sampled_at(field: NDArray[np.float32], x: Float, y: Float, border: int = cv2.BORDER_REPLICATE) -> NDArray[np.float32]:
+    """`sampled` at x and y (n,), which need not lie side by side."""
+    x, y = (of.astype(np.float32) - np.float32(0.5) for of in (x, y))
+    values = np.empty((len(x), *field.shape[2:]), np.float32)
+    for start in range(0, len(x), REMAP_LIMIT):
+        part = slice(start, start + REMAP_LIMIT)
+        values[part] = cv2.remap(field, x[None, part], y[None, part], cv2.INTER_LINEAR, borderMode=border)[0]
     return values
 
 
@@ -117,11 +117,11 @@ def outline(caster: RayCaster, camera: Camera) -> Outline:
     # Not over the distance to the camera, which hardly differs between a face's corners: only the sign and ratios count.
     facing = normal @ camera.centre - np.einsum("ni,ni->n", normal, x)
     turned = facing > 0
-    sides = turned[faces].sum(1, dtype=np.int8)
-    chosen = np.flatnonzero((sides > 0) & (sides < 3))
+    first, second, third = (np.take(turned, faces[:, k]) for k in range(3))
+    chosen = np.flatnonzero((first != second) | (second != third))
     of_corners, facing = turned[faces[chosen]], facing[faces[chosen]]
     # The corner on a side of its own comes first.
-    alone = np.where(sides[chosen] == 1, of_corners.argmax(1), (~of_corners).argmax(1))
+    alone = np.where(of_corners.sum(1) == 1, of_corners.argmax(1), (~of_corners).argmax(1))
     order = (alone[:, None] + np.arange(3)) % 3
     s = np.take_along_axis(facing, order, 1)
     corners = np.take_along_axis(faces[chosen], order, 1)

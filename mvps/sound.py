@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 
 from mvps.checks.ambient import ambient
+from mvps.checks.black import black_level
 from mvps.checks.contents import contents
 from mvps.checks.exponent import looks_curved
 from mvps.checks.lens import lens
@@ -27,9 +28,9 @@ from mvps.scene import Capture
 
 Check = Callable[[Capture], tuple[Capture, list[Finding]]]
 
-OF_VALUES: Sequence[Check] = (contents, lens, silhouettes, curve_undone)
-"""In their order: whether there is anything at all; whether photographs are a pinhole's; what the object is in every view, for which
-photographs may be read again; their values."""
+OF_VALUES: Sequence[Check] = (contents, black_level, lens, silhouettes, curve_undone)
+"""In their order: whether there is anything at all; what cameras add to everything; whether photographs are a pinhole's; what the object is
+in every view, for which photographs may be read again; their values."""
 
 OF_LINEAR: Sequence[Check] = (photographs, ambient, poses)
 """What does not belong, and what all have in common; where the cameras are, which trusts masks and photographs."""

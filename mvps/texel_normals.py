@@ -55,11 +55,11 @@ def texel_normals(surface: Surface, places: Places, own: Float, shown: Shown) ->
 def around(surface: Surface, places: Places, values: Float, known: Bool | Float) -> Float:
     """(n, k) values (n, k) of the points that are known, or weights of theirs (n,), in the mean over the vertices around; 0 where none
     are."""
-    corners, count = surface.faces[places.face], len(surface.vertices)
+    corners, count = np.take(surface.faces, places.face, axis=0), len(surface.vertices)
     weight = places.barycentric * known[:, None]
     sums = [np.bincount(corners.ravel(), (weight * of[:, None]).ravel(), count) for of in (*values.T, np.ones(len(values)))]
     own: Float = np.stack(sums, 1)
     near = own + neighbour_sums(own, edges(surface))
     mean = near[:, :-1] / np.maximum(near[:, -1:], 1e-300)
-    found: Float = np.einsum("nk,nkc->nc", places.barycentric, mean[corners])
+    found: Float = np.einsum("nk,nkc->nc", places.barycentric, np.take(mean, corners, axis=0))
     return found

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise, vertex_tangents
-from mvps.camera import bilinear, footprint, inside_image, project, surface_pixel, view_directions
+from mvps.camera import bilinear, inside_image, project, surface_pixel, view_directions
 from mvps.cores import on_cores, one_by_one
 from mvps.gleam import Senders
 from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
@@ -237,7 +237,7 @@ def _check_lights(lights: Lights, capture: Capture) -> None:
 def _at(texels: Texels, surface: Surface, values: Float) -> Float:
     """(n, ...) values (V, ...) on the surface's vertices, interpolated at texels."""
     weights = texels.barycentric.reshape(texels.barycentric.shape + (1,) * (values.ndim - 1))
-    interpolated: Float = sum(values[surface.faces[texels.face, k]] * weights[:, k] for k in range(3))
+    interpolated: Float = sum(np.take(values, surface.faces[texels.face, k], axis=0) * weights[:, k] for k in range(3))
     return interpolated
 
 
@@ -292,18 +292,20 @@ def _sampled(view: View, hit: Float, told: NDArray[np.float32], known: Bool, pos
     """Which of some surface points (m, 3) the view sees (n,), values (n, k) of the pixels around them, and their weight (n,)."""
     facing = np.einsum("ni,ni->n", normal, view_directions(view.camera, position))
     chosen = np.flatnonzero(facing > STEEPEST_VIEW)
-    image, depth = project(view.camera, position[chosen])
-    inside = (depth > 0) & inside_image(view.camera, image)
-    chosen, image = chosen[inside], image[inside]
+    image, depth = project(view.camera, np.take(position, chosen, axis=0))
+    inside = np.flatnonzero((depth > 0) & inside_image(view.camera, image))
+    chosen, image, depth = chosen[inside], np.take(image, inside, axis=0), depth[inside]
     where, share = bilinear(view.pixel_index, image)
-    pixel = footprint(view.camera, position[chosen])
+    pixel = depth / view.camera.focal_length
     # The four pixels around the point hit the surface within a diagonal of it, stretched by the slope.
-    near = lengths(hit[where] - position[chosen, None]) < (np.sqrt(2) * pixel / facing[chosen])[:, None]
-    share = share * (near & known[where])
-    total = share.sum(1)
+    away = np.take(hit, where, axis=0) - np.take(position, chosen, axis=0)[:, None]
+    near = lengths(away) < (np.sqrt(2) * pixel / facing[chosen])[:, None]
+    share = share * (near & np.take(known, where))
+    total = share[:, 0] + share[:, 1] + share[:, 2] + share[:, 3]
     # Where the point hides behind another part, all four pixels hit that part instead.
-    sees = total > 0.5
-    result = np.einsum("nk,nkc->nc", share[sees], told[where[sees]]) / total[sees, None]
+    sees = np.flatnonzero(total > 0.5)
+    of_pixels = np.take(told, np.take(where, sees, axis=0), axis=0)
+    result = np.einsum("nk,nkc->nc", np.take(share, sees, axis=0), of_pixels) / total[sees, None]
     density = facing[chosen] / pixel**2
     return chosen[sees], result, (density**2 * total)[sees]
 

@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 
 from mvps.camera import project, view_directions
 from mvps.cores import on_cores
-from mvps.mesh import normalise
+from mvps.mesh import dot, normalise
 from mvps.scene import Bool, Capture, Float, Surface, View
 from mvps.silhouette import sampled
 from mvps.texel_normals import Places, around
-from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster, visible_vertices
+from mvps.visibility import Hits, RayCaster, interpolate, interpolate_all, ray_caster, view_hits, visible_vertices
 
 OTHERS = 4
 """Views beside a pixel's own that are asked: they show the same places, and r errs by little more than with all, of which far ones blur
@@ -85,7 +85,7 @@ def drawn_to_surface(capture: Capture, surface: Surface, pictures: list[Picture]
 
 def _facing(view: View, normal: Float, points: Float) -> Float:
     """(n,) squared cosines at which a view sees points with normals (n, 3)."""
-    cosine: Float = (normal * view_directions(view.camera, points)).sum(1).clip(0)
+    cosine: Float = dot(normal, view_directions(view.camera, points)).clip(0)
     return cosine**2
 
 
@@ -93,8 +93,9 @@ def _shown(caster: RayCaster, view: View, picture: Picture) -> _Shown:
     surface, known = caster.surface, np.isfinite(picture).all(-1)
     normals = np.zeros((*known.shape, 4), np.float32)
     normals[known] = np.column_stack([picture[known], np.ones(known.sum())])
-    hits = camera_hits(caster, view.camera, view.pixels)
-    mesh, point = normalise(interpolate(surface, hits, caster.vertex_normals)), interpolate(surface, hits, surface.vertices)
+    hits = view_hits(caster, view)
+    normal, point = interpolate_all(surface, hits, caster.vertex_normals, surface.vertices)
+    mesh = normalise(normal)
     own = normals[view.mask][:, :3].astype(float)
     around_it = cv2.sepFilter2D(normals, -1, BETWEEN, BETWEEN, borderType=cv2.BORDER_CONSTANT)[view.mask].astype(float)
     blurred = around_it[:, :3] / np.maximum(around_it[:, 3:], np.finfo(float).tiny)
@@ -103,17 +104,19 @@ def _shown(caster: RayCaster, view: View, picture: Picture) -> _Shown:
 
 def _products(surface: Surface, of: _Shown, others: list[_Shown]) -> tuple[Float, Float]:
     """(n, 2) (Bp - r) . (p - m) / b and |p - m|^2 of a view's pixels, and (n,) their weight, 0 where no other view shows the place."""
-    corners, total = surface.faces[of.hits.face.clip(0)], np.zeros_like(of.own)
+    corners, total = np.take(surface.faces, of.hits.face.clip(0), axis=0).T, np.zeros_like(of.own)
     facing = _facing(of.view, of.mesh, of.point)
     for other in others:
-        seen = np.flatnonzero((of.hits.face >= 0) & other.sees[corners].all(1))
-        found = sampled(other.picture, project(other.view.camera, of.point[seen])[0], cv2.BORDER_CONSTANT)
-        weight = _facing(other.view, of.mesh[seen], of.point[seen])
+        first, second, third = (np.take(other.sees, corner) for corner in corners)
+        seen = np.flatnonzero((of.hits.face >= 0) & first & second & third)
+        point, mesh = (np.take(values, seen, axis=0) for values in (of.point, of.mesh))
+        found = sampled(other.picture, project(other.view.camera, point)[0], cv2.BORDER_CONSTANT)
+        weight = _facing(other.view, mesh, point)
         weight *= (found[:, 3] > WHOLE) & (weight >= ASLANT * facing[seen])
         total[seen] += normalise(found[:, :3].astype(float)) * weight[:, None]
     away, told = of.own - of.mesh, (total != 0).any(1) & (of.own != 0).any(1)
     apart = (of.blurred - normalise(total)) / BETWEEN[1] ** 2
-    return np.stack([(apart * away).sum(1), (away**2).sum(1)], 1), told * facing
+    return np.stack([dot(apart, away), dot(away, away)], 1), told * facing
 
 
 def _drawn(of: _Shown, picture: Picture, part: Float) -> Picture:

@@ -16,11 +16,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from mvps.camera import pixel_centres, project, rays, view_directions
+from mvps.camera import inside_image, pixel_centres, project, rays, view_directions
 from mvps.cores import on_cores
 from mvps.mesh import edges, mean_edge_length, vertex_normals
 from mvps.once import computed_once, once_for
-from mvps.scene import Bool, Camera, Float, Int, Surface
+from mvps.scene import Bool, Camera, Float, Int, Surface, View
 
 RAYS_PER_CALL = 1 << 18
 
@@ -115,14 +115,24 @@ def camera_hits(caster: RayCaster, camera: Camera, pixels: Int) -> Hits:
     return caster.first_hits(*rays(camera, pixel_centres(pixels)))
 
 
+@once_for
+def view_hits(caster: RayCaster, view: View) -> Hits:
+    """`camera_hits` of a view's pixels."""
+    return camera_hits(caster, view.camera, view.pixels)
+
+
 def interpolate(surface: Surface, hits: Hits, values: Float) -> Float:
     """Values (V, ...) on the vertices, interpolated at hits (n, ...); a miss gives zeros."""
-    columns = surface.faces[np.maximum(hits.face, 0)]
-    weights = sp.csr_matrix(
-        (hits.barycentric.ravel(), columns.ravel(), np.arange(0, columns.size + 1, 3)), (len(columns), len(surface.vertices))
-    )
-    interpolated: Float = (weights @ values.reshape(len(values), -1)).reshape(len(columns), *values.shape[1:])
-    return interpolated
+    return interpolate_all(surface, hits, values)[0]
+
+
+def interpolate_all(surface: Surface, hits: Hits, *values: Float) -> list[Float]:
+    """`interpolate` of several values, which share the weights."""
+    # In 32 bits: of longer indices scipy asks whether these would do.
+    corners = np.take(surface.faces, np.maximum(hits.face, 0), axis=0).astype(np.int32)
+    ends = np.arange(0, corners.size + 1, 3, dtype=np.int32)
+    weights = sp.csr_matrix((hits.barycentric.ravel(), corners.ravel(), ends), (len(corners), len(surface.vertices)))
+    return [(weights @ of.reshape(len(of), -1)).reshape(len(corners), *of.shape[1:]) for of in values]
 
 
 @once_for
@@ -133,7 +143,7 @@ def visible_vertices(caster: RayCaster, camera: Camera, margin: int = 0) -> Bool
     image, depth = project(camera, vertices)
     towards = view_directions(camera, vertices)
     candidates = (depth > 0) & (np.einsum("ni,ni->n", normal, towards) > 0)
-    candidates &= (image >= 0).all(-1) & (image[:, 0] < camera.width) & (image[:, 1] < camera.height)
+    candidates &= inside_image(camera, image)
     chosen = np.flatnonzero(candidates)
     hidden = caster.occluded(vertices[chosen] + caster.offset * normal[chosen], towards[chosen])
     visible, behind = np.zeros((2, len(vertices)), bool)

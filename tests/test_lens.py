@@ -9,8 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvps.checks.lens import bent, free_of_lens, lens, seen_at, straightened
+from mvps.checks.lens import bent, lens, straightened
+from mvps.distortion import free_of_lens, seen_at
+from mvps.load import read_truth
+from mvps.mesh import angles_deg
 from mvps.scene import Camera, Capture
+from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
 
@@ -102,3 +106,21 @@ def test_clipped_samples_stay_clipped(clean: Capture) -> None:
     samples[:, 1] = view.saturation
     after = straightened(replace(view, samples=samples))
     assert not after.usable([1]).any() and after.usable([0]).all()
+
+
+def test_true_normals_of_photographs_that_show_the_lens_are_straightened(tmp_path: Path) -> None:
+    clean, truth = render_capture(SceneSettings(views=1, lights=2, size=96))
+    given = through_lens(clean, 3.0)
+    (camera,), (mask,) = [view.camera for view in given.views], [view.mask for view in given.views]
+    name, (rows, columns) = clean.views[0].name, np.indices(mask.shape)
+    free = free_of_lens(camera, np.stack([columns, rows], -1).reshape(-1, 2) + 0.5)
+    column, row = np.floor(free).astype(int).clip(0, 95).T
+    seen = np.where(mask[..., None], truth.normals[name][row, column].reshape(*mask.shape, 3), np.nan)
+    write_capture(given, replace(truth, normals={name: seen}), tmp_path / "capture")
+    as_photographed = read_truth(tmp_path / "capture").normals[name]
+    straight = read_truth(tmp_path / "capture", {name: clean.views[0].camera}).normals[name]
+    assert np.isfinite(straight[clean.views[0].mask]).all(-1).mean() > 0.97
+    both = np.isfinite(as_photographed).all(-1) & np.isfinite(straight).all(-1) & clean.views[0].mask
+    before, after = (float(np.mean(angles_deg(of[both].astype(float), truth.normals[name][both]))) for of in (as_photographed, straight))
+    assert before > 2 and after < 0.4 * before
+    np.testing.assert_array_equal(read_truth(tmp_path / "capture", {name: camera}).normals[name], as_photographed)

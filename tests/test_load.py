@@ -166,6 +166,14 @@ def test_clip_level_below_full_scale_is_found_from_its_crowd(clip: int) -> None:
     assert clip_level(counts(np.minimum(exposure(gain=clip / 5).round(), clip))) == clip
 
 
+@pytest.mark.parametrize("beyond", [1, 5])
+def test_a_few_samples_beyond_the_crowd_are_no_clip_level(beyond: int) -> None:
+    codes = np.minimum(exposure(gain=16383 / 5).round(), 16383)
+    assert (codes == 16383).sum() >= 100 * beyond
+    codes[np.flatnonzero(codes < 16383)[:beyond]] = 65535
+    assert clip_level(counts(codes)) == 16383
+
+
 def test_smooth_maxima_are_no_clip_level() -> None:
     y, x = np.mgrid[-1:1:600j, -1:1:600j]
     sphere = np.sqrt(np.maximum(1 - x**2 - y**2, 0))

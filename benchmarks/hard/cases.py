@@ -11,23 +11,25 @@ from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hard import damage, scenes
 from hard.damage import Damage
 from hard.lumps import lumps
 from hard.scenes import BASE, Change, rendered
-from mvps.scene import Capture, Surface, Truth
-from mvps.synthetic.scene import Photograph
+from mvps.scene import Capture, Surface, Truth, View
+from mvps.synthetic.scene import WHITE, Photograph
 from mvps.synthetic.settings import SceneSettings
 
 
 class Sample(NamedTuple):
-    """The capture that the program is given, the good one, and the good one's truth; bright: a wall stands behind the object."""
+    """The capture that the program is given, the good one, and the good one's truth; behind: what photographs of a good view show
+    behind the object, (lights, 3), where that is not black."""
 
     given: Capture
     good: Capture
     truth: Truth
-    bright: bool = False
+    behind: Callable[[View], NDArray[np.uint16]] | None = None
 
 
 class Case(NamedTuple):
@@ -62,7 +64,12 @@ def damaged(by: Damage, amount: float, settings: SceneSettings = BASE) -> Sample
 
 def bright(px: float) -> Sample:
     """The base in front of a bright wall, with masks that reach this much too far."""
-    return damaged(damage.before_bright, px)._replace(bright=True)
+    return damaged(damage.before_bright, px)._replace(behind=damage.background)
+
+
+def with_black_level(share: float) -> Sample:
+    """The base by a camera whose black level, this share of full scale, was left in."""
+    return damaged(damage.black_level, share)._replace(behind=lambda view: np.full((len(view.lights), 3), round(share * WHITE), np.uint16))
 
 
 def _number(value: float) -> str:
@@ -118,6 +125,8 @@ def _photographs() -> Iterator[tuple[str, Callable[[], Sample]]]:
     yield "gamma-2.2-noise-3-percent", partial(damaged, damage.gamma, 2.2, replace(BASE, noise=0.03))
     for percent in (5, 20):
         yield f"ambient-{percent}-percent", partial(damaged, damage.ambient, percent / 100)
+    for percent in (1, 4):
+        yield f"black-level-{percent}-percent", partial(with_black_level, percent / 100)
     for percent in (10, 40):
         yield f"exposures-{percent}-percent", partial(damaged, damage.exposed_anew, percent / 100)
     for percent in (3, 10):

@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from mvps.camera import project
-from mvps.checks.lens import free_of_lens
+from mvps.distortion import free_of_lens
 from mvps.scene import Bool, Camera, Capture, Float, View
 from mvps.synthetic.scene import WHITE, make_scene, photograph_scene
 from mvps.synthetic.settings import SceneSettings
@@ -81,6 +81,11 @@ def ambient(capture: Capture, share: float, rng: np.random.Generator) -> Capture
         return with_values(view, view.radiance() + share * np.median(view.radiance()) / np.median(mean) * mean)
 
     return each_view(capture, lit)
+
+
+def black_level(capture: Capture, share: float, rng: np.random.Generator) -> Capture:
+    """This share of full scale in every sample, all else below it darker by as much."""
+    return each_view(capture, lambda view: with_values(view, share + (1 - share) * view.radiance()))
 
 
 def two_swapped(capture: Capture, _: float, rng: np.random.Generator) -> Capture:

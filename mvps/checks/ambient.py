@@ -36,6 +36,7 @@ from mvps.checks.radiometry import is_metal
 from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.scene import Bool, Capture, Float, View
+from mvps.values import channel_mean
 from solvers.low_rank import factorise, solve_rows
 
 FEWEST_LIGHTS = 6
@@ -82,10 +83,10 @@ class _Factors:
 
 def _factors(view: View, chosen: NDArray[np.int64], s: Float | None = None) -> _Factors:
     """Of some of a view's pixels; with s the lights are known already."""
-    image = view.samples[chosen].mean(-1, dtype=np.float64) * view.scale
+    image = channel_mean(view.samples[chosen]) * view.scale
     bright = np.maximum(np.quantile(image[:, view.shown], 0.8, axis=1, keepdims=True), view.scale)
     M = image / bright
-    known = (view.samples[chosen] < view.saturation).all(-1) & (M > LIT)
+    known = view.usable()[chosen] & (M > LIT)
     if s is None:
         found = factorise(M, known, 3, floor=1e-3)
         b, s = found.left, found.right

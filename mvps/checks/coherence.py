@@ -25,7 +25,7 @@ from skimage.measure import find_contours
 from mvps.camera import project, rays
 from mvps.motions import Object, image_derivatives, units
 from mvps.scene import Bool, Camera, Float, Int
-from mvps.silhouette import sampled
+from mvps.silhouette import sampled, sampled_at
 
 COARSE_PIXELS, FINE_STEPS = 2.0, 10
 """Step along a line of sight, pixels, and the parts into which the two steps around the least value are divided."""
@@ -74,9 +74,10 @@ def _along(cameras: Sequence[Camera], fields: Fields, own: int, origins: Float, 
         start = (origins @ camera.rotation.T + camera.translation) @ camera.K.T
         slope = directions @ camera.rotation.T @ camera.K.T
         x, y, depth = (start[:, k, None] + t * slope[:, k, None] for k in range(3))
-        m = sampled(field, np.stack([x / depth, y / depth], -1).reshape(-1, 2)).reshape(t.shape)
+        m = sampled_at(field, (x / depth).ravel(), (y / depth).ravel()).reshape(t.shape)
         above = m > largest
-        largest[above], whose[above] = m[above], j
+        np.copyto(largest, m, where=above)
+        np.copyto(whose, j, where=above)
     return largest, whose
 
 

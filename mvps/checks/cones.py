@@ -92,13 +92,13 @@ class Cones:
     def _kept(self, points: Float, fields: Sequence[NDArray[np.float32]]) -> tuple[Float, Bool]:
         """Points that no more views exclude than may be wrong and one more, and which do."""
         most, count = wrong_at_most(len(fields)) + 1, np.zeros(len(points), np.int32)
-        rows: list[Bool] = []
+        place, excluded = np.arange(len(points)), np.zeros((len(fields), len(points)), bool)
         for view, field in enumerate(fields):
-            out = self._excluded(view, field, points)
+            out = excluded[view, place] = self._excluded(view, field, points)
             count += out
-            keep = count <= most
-            points, count, rows = points[keep], count[keep], [row[keep] for row in [*rows, out]]
-        return points, np.stack(rows)
+            keep = np.flatnonzero(count <= most)
+            points, count, place = np.take(points, keep, axis=0), count[keep], place[keep]
+        return points, excluded[:, place]
 
     def _excluded(self, view: int, field: NDArray[np.float32], points: Float) -> Bool:
         camera = self.capture.views[view].camera

@@ -1,10 +1,6 @@
 """Distortion of the lens that a calibration gives: still in the photographs, or undone before.
 
-A pinhole shows a point of the camera's frame at x = (X / Z, Y / Z); through the lens it appears at
-
-    x (1 + k1 r^2 + k2 r^4 + k5 r^6) + (2 k3 x y + k4 (r^2 + 2 x^2), k3 (r^2 + 2 y^2) + 2 k4 x y),      r = |x|
-
-(Brown 1971, in the order of the Caltech toolbox). Calibrations keep these numbers when photographs are undistorted, so they do not say
+Calibrations keep its numbers (distortion.py) when photographs are undistorted, so they do not say
 whether photographs are. Silhouettes do: with the lens undone in the masks, or not, the lines of sight along the outlines miss what the
 other views leave of the object by less (coherence.py). Where that is certain, photographs follow.
 """
@@ -13,16 +9,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from mvps.checks.outlines import MASK_NOISE, fallen, misfit, outlines_of
 from mvps.cores import on_cores
+from mvps.distortion import free_of_lens, seen_at, straightener
 from mvps.finding import Finding
 from mvps.material import CERTAIN
 from mvps.mesh import lengths
-from mvps.scene import Camera, Capture, Float, View
+from mvps.scene import Capture, View
 
 LEAST_VIEWS = 3
 """Two views share the lines of sight through two outline points alone."""
@@ -34,8 +29,6 @@ misses by more or less for no other reason."""
 NOISE = float(np.sqrt(2) * MASK_NOISE)
 """Of a miss, pixels: that of two views' outlines. Misses no larger say nothing: those of a solid of revolution fall whenever masks get
 smaller."""
-
-Image = NDArray[np.float32]
 
 
 def lens(capture: Capture) -> tuple[Capture, list[Finding]]:
@@ -61,29 +54,13 @@ def lens(capture: Capture) -> tuple[Capture, list[Finding]]:
     return capture, [Finding("pose", "all views", text, True)]
 
 
-def free_of_lens(camera: Camera, points: Float) -> Float:
-    """Where a pinhole would have image coordinates (n, 2) of the photograph."""
-    if not (any(camera.distortion) and len(points)):
-        return points
-    # OpenCV takes the photograph's own K for one without skew.
-    own = points - (points[:, 1:] - camera.K[1, 2]) / camera.K[1, 1] * [camera.K[0, 1], 0]
-    return np.asarray(cv2.undistortPoints(own[:, None], camera.K, np.array(camera.distortion), P=camera.K), np.float64)[:, 0]
-
-
-def seen_at(camera: Camera) -> tuple[Image, Image]:
-    """Column and row (height, width) of the photograph, 0 at the first pixel's centre, where each pixel of the pinhole's image is seen."""
-    K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    column, row = cv2.initUndistortRectifyMap(K, np.array(camera.distortion), np.eye(3), K, (camera.width, camera.height), cv2.CV_32FC1)
-    return np.asarray(column + K[0, 1] / K[1, 1] * (row - K[1, 2]), np.float32), np.asarray(row)
-
-
 def bent(view: View) -> float:
     """By how much the lens moves the object's pixels at most, pixels, beside what a shift of the whole image does."""
     if not any(view.camera.distortion):
         return 0.0
     column, row = seen_at(view.camera)
     rows, columns = view.pixels.T
-    moved: Float = np.stack([column[rows, columns] - columns, row[rows, columns] - rows], -1)
+    moved = np.stack([column[rows, columns] - columns, row[rows, columns] - rows], -1)
     return float(lengths(moved - moved.mean(0)).max())
 
 
@@ -92,11 +69,7 @@ def straightened(view: View) -> View:
     clipped. Its files show something else and are forgotten."""
     if not any(view.camera.distortion):
         return view
-    column, row = seen_at(view.camera)
-
-    def at(image: Image) -> Image:
-        return np.asarray(cv2.remap(image, column, row, cv2.INTER_LINEAR))
-
+    at = straightener(view.camera)
     share = at(view.mask.astype(np.float32))
     mask = share > 0.5
     samples = np.empty((int(mask.sum()), *view.samples.shape[1:]), np.uint16)

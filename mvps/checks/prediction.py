@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.scene import Bool, Float, Int, View
+from mvps.values import channel_mean
 
 PIXELS = 400
 """Drawn from a view: the median of its residuals is then known to 1.25 / sqrt(400) = 6 % of their spread."""
@@ -56,8 +57,7 @@ class Sampled:
 
 def grey(samples: NDArray[np.uint16]) -> NDArray[np.float32]:
     """Mean over the channels (..., 3), in code values."""
-    mean: NDArray[np.float32] = samples.mean(-1, dtype=np.float32)
-    return mean
+    return channel_mean(samples, np.float32)
 
 
 def sampled(view: View, pixels: int, generator: np.random.Generator) -> Sampled:

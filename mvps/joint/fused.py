@@ -26,7 +26,7 @@ from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.joint.pixels import few_lights
 from mvps.joint.sharpened import PIXEL_BLUR, pixel_area, sharpened, within
-from mvps.mesh import face_normals, lengths, normalise
+from mvps.mesh import centres, face_normals, lengths, normalise
 from mvps.scene import Bool, Capture, Float, Int, NormalMap, Surface
 from mvps.silhouette import sampled
 
@@ -75,18 +75,19 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
     seen: per view the vertices it sees; a face is seen where all its corners are. otherwise (V, 3): vertex normals for unseen faces.
     """
     faces = surface.faces
-    centre, facing = surface.vertices[faces].mean(1), face_normals(surface)
+    centre, facing = centres(surface), face_normals(surface)
     total, (weights, squares, blur) = np.zeros((len(faces), 3)), np.zeros((3, len(faces)))
 
     def of_view(i: int) -> tuple[Int, Float]:
         view, photometric = capture.views[i], maps[i]
         visible = np.zeros(len(surface.vertices), bool)
         visible[seen[i]] = True
-        chosen = np.flatnonzero(visible[faces].all(1))
+        first, second, third = (np.take(visible, faces[:, k]) for k in range(3))
+        chosen = np.flatnonzero(first & second & third)
         image = np.zeros((*view.mask.shape, 4), np.float32)
-        image[view.mask] = np.column_stack([photometric.normal, np.ones(len(view.pixels))]) * photometric.confidence[:, None]
-        points = centre[chosen]
-        cosine = np.einsum("ni,ni->n", facing[chosen], view_directions(view.camera, points)).clip(0)
+        image[view.mask] = np.column_stack([photometric.normal, np.ones(len(view.pixels), np.float32)]) * photometric.confidence[:, None]
+        points = np.take(centre, chosen, axis=0)
+        cosine = np.einsum("ni,ni->n", np.take(facing, chosen, axis=0), view_directions(view.camera, points)).clip(0)
         found = sampled(image, project(view.camera, points)[0], cv2.BORDER_CONSTANT) * (cosine**2)[:, None]
         area = pixel_area(view.camera, points, cosine)
         # Between pixels of a bent surface the mean is shorter, which is no scatter of views.
@@ -112,7 +113,7 @@ def face_targets(capture: Capture, surface: Surface, maps: tuple[NormalMap, ...]
 
 def _without_blur(normal: Float, blur: Float, error: Float, known: Bool, surface: Surface) -> Float:
     """Normals (F, 3), unit, without their blur (F,); error (F,) of theirs along a tangent, NaN where not known."""
-    centre = surface.vertices[surface.faces].mean(1) - surface.vertices.mean(0)
+    centre = centres(surface) - surface.vertices.mean(0)
     corners = surface.faces.ravel(), np.arange(0, surface.faces.size + 1, 3)
     held = sp.csr_matrix((np.ones(surface.faces.size), *corners), (len(normal), len(surface.vertices)))
     around, over_some, beside = partial(_mean_around, held=held), partial(_around, known=known, surface=surface), held @ held.T
@@ -130,11 +131,11 @@ def _mean_around(values: Float, held: sp.csr_matrix) -> Float:
 
 def _around(values: Float, known: Bool, surface: Surface) -> Float:
     """(F,) values, where known, averaged with those of the faces around; NaN where none around is."""
-    corners, count = surface.faces.ravel(), len(surface.vertices)
+    corners, count, (a, b, c) = surface.faces.ravel(), len(surface.vertices), surface.faces.T
     share = known.astype(np.float64)
     for _ in range(ROUNDS):
         of_corners = [np.bincount(corners, np.repeat(of_faces * share, 3), count) for of_faces in (values, np.ones_like(share))]
-        top, bottom = (of_all[surface.faces].sum(1) for of_all in of_corners)
+        top, bottom = (of_all[a] + of_all[b] + of_all[c] for of_all in of_corners)
         share = (bottom > 0).astype(np.float64)
         values = np.where(bottom > 0, top / np.where(bottom > 0, bottom, 1), 0)
     return np.where(share > 0, values, np.nan)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from mvps.cores import on_cores
 from mvps.joint.agreement import Agreement
-from mvps.mesh import cross, face_areas, face_normals, vertex_normals
+from mvps.mesh import corners, cross, face_areas, face_normals, vertex_normals
 from mvps.scene import Capture, Float, Surface
 from mvps.silhouette import outline, sampled
 from mvps.visibility import ray_caster
@@ -106,8 +106,8 @@ def _laplacian(surface: Surface, weight: Float) -> sp.csr_matrix:
 def _turned_divergence(surface: Surface, target: Float, weight: Float) -> Float:
     """(V, 3) divergence of weight (F,) R_f grad x: a corner of face f takes R_f (n x opposite side) / 2, its hat function's gradient times
     the area."""
-    normal, corners = face_normals(surface), [surface.vertices[surface.faces[:, k]] for k in range(3)]
-    first, second = (turned(normal, target, cross(normal, corners[k - 1] - corners[k - 2]) / 2) * weight[:, None] for k in (0, 1))
+    normal, ends = face_normals(surface), corners(surface)
+    first, second = (turned(normal, target, cross(normal, ends[k - 1] - ends[k - 2]) / 2) * weight[:, None] for k in (0, 1))
     divergence = np.zeros_like(surface.vertices)
     # The three sides of a face add up to nothing.
     for k, share in enumerate((first, second, -first - second)):

@@ -1,7 +1,7 @@
 """Calib_Results.mat and scene.json -> cameras.
 
     Calib_Results.mat   KK (3, 3), or KK_i per view; Rc_i (3, 3), Tc_i (3, 1): camera_from_world of view i, OpenCV axes;
-                        optional kc (5, 1), or kc_i: distortion of the lens (checks/lens.py)
+                        optional kc (5, 1), or kc_i: distortion of the lens (distortion.py)
     scene.json          optional; "pixel_center": image coordinate c of the first pixel's centre (absent: 0)
 
 An image coordinate of the file plus (0.5 - c) is ours, whose first pixel's centre is at 0.5: so is the principal point.

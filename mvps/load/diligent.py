@@ -229,7 +229,8 @@ def _decode_all(plans: Sequence[_Plan]) -> tuple[list[NDArray[np.uint16]], list[
     def fill(task: tuple[int, int]) -> None:
         view, light = task
         image = decode(plans[view].files[light], plans[view].header)
-        samples[view][:, light] = image.reshape(-1, 3)[foreground[view]]
+        # Turned back to the decoder's order, channels need no copy before few pixels are left of them.
+        samples[view][:, light, ::-1] = np.take(image[..., ::-1].reshape(-1, 3), foreground[view], axis=0)
         # Integers, the same sum in whatever order photographs come; 32 bits hold 20 000 photographs.
         with locks[view]:
             for channel in range(3):
@@ -255,13 +256,14 @@ def with_mask(view: View, mask: Bool) -> View:
     kept = mask & view.mask
     samples = np.empty((int(mask.sum()), len(view.lights), 3), np.uint16)
     samples[kept[mask]] = view.samples[kept[view.mask]]
-    added = mask & ~view.mask
+    added, black = mask & ~view.mask, np.array(view.black, np.uint16)
     if added.any():
         new = np.empty((int(added.sum()), len(view.lights), 3), np.uint16)
 
         def fill(light: int) -> None:
             file = view.files[light]
-            new[:, light] = decode(file, read_header(file))[added]
+            read = decode(file, read_header(file))[added]
+            new[:, light] = np.where((read < view.saturation).all(-1, keepdims=True), np.maximum(read, black) - black, read)
             if not view.usable([light]).any():
                 new[:, light] = np.iinfo(np.uint16).max
 

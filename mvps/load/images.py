@@ -191,6 +191,10 @@ def histogram(samples: Sequence[NDArray[np.uint16]]) -> Int:
     return counts
 
 
+STRAY = 0.01
+"""Of the samples that are clipped."""
+
+
 def clip_level(counts: Int) -> int:
     """The code value at and above which 16-bit samples are clipped, from how many samples hold each code (65536,).
 
@@ -202,14 +206,16 @@ def clip_level(counts: Int) -> int:
     have equal areas from code to code, and those along a ridge grow as the square root of the distance to the maximum, so
     the last code holds 1 / (sqrt(2) - 1) = 2.4 times the one before. So the largest code is a clip level where it holds
     more than 4 times what any other code of the top tenth holds, 16 samples added against chance, and that tenth
-    holds 8 codes at least, without which there is no tail to compare with.
+    holds 8 codes at least, without which there is no tail to compare with. What holds less than STRAY of that beyond it is
+    no sensor's (a pixel that was painted in).
     """
     codes = np.flatnonzero(counts)
     if not len(codes) or codes[-1] == 0:
         return 65535
     step = int(np.gcd.reduce(codes))
     full_scale = 65535 // step * step if step <= 257 else 65535
-    top = int(codes[-1])
+    beyond = counts[codes][::-1].cumsum()[::-1] - counts[codes]
+    top = int(codes[beyond <= STRAY * counts[codes]].min())
     tail = codes[(codes >= 0.9 * top) & (codes < top)]
     crowded = len(tail) >= 8 and counts[top] > 4 * counts[tail].max() + 16
     return top if crowded else full_scale

@@ -7,7 +7,8 @@ CAPTURE/mesh_Gt.ply                     world frame and units
 
 x_world = rotation^T DILIGENT_FROM_CAMERA^T x_diligent
 
-with the rotation of the camera as it is used: lamps and normals are measured with the camera, and turn with it where it is moved.
+with the rotation of the camera as it is used: lamps and normals are measured with the camera, and turn with it where it is moved. Where
+photographs are used without their lens's distortion normals are, too.
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import DILIGENT_FROM_CAMERA
+from mvps.distortion import straightener
 from mvps.inputs import DAMAGED
 from mvps.load.calibration import LARGEST, read_calibration
 from mvps.load.diligent import view_folders
 from mvps.load.images import TEXT_LIMIT, complaint, read_bytes, read_mask
 from mvps.load.matfile import numbers_of, read_variables
+from mvps.mesh import normalise
 from mvps.scene import Camera, Capture, Float, Lights, Surface, Truth
 
 ONE_RIG_TOLERANCE = 1e-3
@@ -49,6 +52,9 @@ def read_truth(path: str | Path, cameras: Mapping[str, Camera] = MappingProxyTyp
         world_from_diligent = _world_from_diligent(rotation)
         if os.path.lexists(folder / "Normal_gt.mat"):
             normals[folder.name] = _normals(folder, world_from_diligent)
+            recorded = calibration.camera(number, *normals[folder.name].shape[:2])
+            if folder.name in cameras and recorded.distortion != cameras[folder.name].distortion:
+                normals[folder.name] = _straightened(normals[folder.name], recorded)
         if os.path.lexists(folder / "light_directions.txt"):
             direction[folder.name] = _directions(folder) @ world_from_diligent.T
         if os.path.lexists(folder / "light_intensities.txt"):
@@ -120,6 +126,16 @@ def _normals(folder: Path, world_from_diligent: Float) -> NDArray[np.float32]:
     world = np.divide(world, length, out=np.full_like(world, np.nan), where=length > 0)
     world[~mask] = np.nan
     return np.asarray(world, np.float32)
+
+
+def _straightened(normals: NDArray[np.float32], recorded: Camera) -> NDArray[np.float32]:
+    """Normals (height, width, 3) on the pixels of a pinhole in place of those of a camera with a lens."""
+    known = np.isfinite(normals[..., 0])
+    weighted = np.concatenate([np.nan_to_num(normals), known[..., None]], -1, dtype=np.float32)
+    found = straightener(recorded)(weighted)
+    straight: NDArray[np.float32] = normalise(found[..., :3]).astype(np.float32)
+    straight[found[..., 3] <= 0.5] = np.nan
+    return straight
 
 
 def _directions(folder: Path) -> Float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import cv2
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from mvps.camera import DILIGENT_FROM_CAMERA
 from mvps.gleam import Senders
 from mvps.pbr import reflectance_scale, srgb_bytes
-from mvps.rendering import RAYS_ACROSS, light_arriving, photograph, points_under, shadow_at
+from mvps.rendering import RAYS_ACROSS, light_arriving, photograph_and_gloss, points_under, shadow_at
 from mvps.scene import Bool, Float, Reconstruction, View, expected_error_deg
 from mvps.visibility import RayCaster
 
@@ -50,9 +49,8 @@ def view_pictures(caster: RayCaster, senders: Senders | None, reconstruction: Re
     material = reconstruction.material
     measured = view.radiance([chosen])[:, 0]
     arriving = light_arriving(senders, direction, view.camera.centre)
-    rendered = photograph(caster, material, view.camera, view.pixels, direction, intensity, arriving, RAYS_ACROSS)[:, 0]
-    dark = replace(material, albedo=np.zeros_like(material.albedo))
-    specular = photograph(caster, dark, view.camera, view.pixels, direction, intensity, side=RAYS_ACROSS)[:, 0]
+    shown = photograph_and_gloss(caster, material, view.camera, view.pixels, direction, intensity, arriving, RAYS_ACROSS)
+    rendered, specular = (image[:, 0] for image in shown)
     points = points_under(caster, material, view.camera, view.pixels)
     cast = shadow_at(caster, material.law, points, direction)[:, 0]
     attached = points.normal @ direction[0] <= 0
