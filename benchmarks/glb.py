@@ -68,6 +68,8 @@ def read_glb(path: Path) -> Model:
     (primitive,) = document["meshes"][0]["primitives"]
     material = document["materials"][primitive["material"]]
     position, normal, tangent, uv = (array(primitive["attributes"][n]) for n in ("POSITION", "NORMAL", "TANGENT", "TEXCOORD_0"))
+    (node,) = document["nodes"]
+    position = position + np.array(node.get("translation", [0.0] * 3))
     pbr, specular = material["pbrMetallicRoughness"], material["extensions"]["KHR_materials_specular"]
     if pbr["metallicFactor"] != 0:
         raise ValueError(f"{path}: wanted a material that is not metallic, given a metallicFactor of {pbr['metallicFactor']}")

@@ -32,22 +32,23 @@ Metals have no diffuse body, and the factors say nothing: where highlights expla
 are those by correlation (correlation.py).
 
 Views with fewer than MINIMUM_LIGHTS lights cannot be factorised; there the lights are the least-squares solution of I_pl = n_p . s_l
-for the rough shape's normals, one albedo for the whole object (other albedos are outliers), of all views together where they share lights.
+for the rough shape's normals, one albedo for the whole object (other albedos are outliers), of all views together where they share lights;
+other views beside them are solved without them.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvps.between_views import BODY, CLEARLY_NEARER, nearer, nearest, said
 from mvps.cores import on_cores
 from mvps.correlation import alike_in_all_views, glossy_lights, is_glossy, lamps_of_a_glossy_surface
-from mvps.mesh import normalise, vertex_normals
+from mvps.mesh import lengths, normalise, vertex_normals
 from mvps.pixel_samples import BRIGHT_QUANTILE, PIXELS_PER_VIEW, SHADOWED, PixelSamples, in_frame, pixel_samples, pooled
-from mvps.scene import Capture, CaptureError, Float, Lights, Surface, View
+from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface, View
 from mvps.sharing import shared_frame, vertex_samples
 from mvps.visibility import RayCaster, ray_caster
 from solvers.low_rank import Factorisation, factorise, of_length_one, robust_weights, solve_rows
@@ -263,10 +264,12 @@ def normalised(directions: list[Float], intensities: list[Float], one_rig: bool,
 def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share: bool = True) -> Calibration:
     """Directions and intensities of all lights from the images and a rough surface's normals (module docstring); may_share: one rig is
     tried."""
+    counts = {len(view.lights) for view in capture.views}
+    if min(counts) < MINIMUM_LIGHTS <= max(counts):
+        return _of_unequal(capture, surface, seed, may_share)
     generator = np.random.default_rng(seed)
     caster, normal = ray_caster(surface), vertex_normals(surface)
     samples = [pixel_samples(view, caster, normal, generator) for view in capture.views]
-    counts = {len(view.lights) for view in capture.views}
     may_share &= len(capture.views) > 1 and len({view.lights for view in capture.views}) == 1
     if min(counts) < MINIMUM_LIGHTS:
         frame = shared_frame(capture, caster, np.random.default_rng(seed)) if may_share else None
@@ -292,6 +295,28 @@ def uncalibrated_lights(capture: Capture, surface: Surface, seed: int, may_share
     by_factors = [_by_factors(f, [s]) for f, s in zip(separate, samples, strict=True)]
     scaled, under_normals = _believed(capture, caster, samples, by_factors, residual, False, seed)
     return Calibration(_assemble(capture, scaled, False), residual, fourth, under_normals=under_normals)
+
+
+def _of_unequal(capture: Capture, surface: Surface, seed: int, may_share: bool) -> Calibration:
+    """Where some views have fewer than MINIMUM_LIGHTS lights: of the others as if these were not there, of these by the rough shape's
+    normals, as strong over the others as they are where both are found so."""
+    enough = [view for view in capture.views if len(view.lights) >= MINIMUM_LIGHTS]
+    found = uncalibrated_lights(Capture(capture.name, tuple(enough)), surface, seed, may_share)
+    generator, caster, normal = np.random.default_rng(seed), ray_caster(surface), vertex_normals(surface)
+    own = {view.name: _from_normals(pixel_samples(view, caster, normal, generator)) for view in capture.views}
+    stronger = [e.mean(1) / lengths(own[view.name]) for view, e in zip(enough, found.lights.intensity, strict=True)]
+    factor = float(np.median(np.concatenate(stronger)))
+    names = [view.name for view in enough]
+    directions, intensities = [], []
+    for view in capture.views:
+        if view.name in names:
+            at = names.index(view.name)
+            directions.append(found.lights.direction[at])
+            intensities.append(found.lights.intensity[at])
+        else:
+            directions.append(normalise(own[view.name]) @ view.camera.rotation)
+            intensities.append(factor * lengths(own[view.name])[:, None] * colour_ratios(view))
+    return replace(found, lights=normalised(directions, intensities, False), under_normals=True)
 
 
 def _one_rig(
@@ -386,13 +411,21 @@ def is_metallic(capture: Capture, surface: Surface, seed: int) -> bool:
     return is_glossy([s.highlights for s in samples], [s.normal for s in samples], generator)
 
 
+def _of_shown(ratios: Float, shown: Bool) -> Float:
+    """(lights, 3) mean over the views (views, lights, 3) that show a light (views, lights); 1 where none does."""
+    if shown.all():
+        mean: Float = ratios.mean(0)
+        return mean
+    count = shown.sum(0)[:, None]
+    return np.where(count > 0, np.where(shown[..., None], ratios, 0).sum(0) / np.maximum(count, 1), 1.0)
+
+
 def _assemble(capture: Capture, scaled: list[Float], one_rig: bool, fixed: bool = False) -> Lights:
     """Lights of intensity times direction (lights, 3) of every view, in the cameras' frames; fixed: in the world's."""
     ratios = on_cores(colour_ratios, capture.views)
     if one_rig:
-        mean = np.mean(ratios, axis=0)
-        ratios = [mean] * len(ratios)
-    lengths = [np.linalg.norm(s, axis=1, keepdims=True) for s in scaled]
-    unit = [s / length for s, length in zip(scaled, lengths, strict=True)]
+        ratios = [_of_shown(np.array(ratios), np.array([view.shown for view in capture.views]))] * len(ratios)
+    strength = [np.linalg.norm(s, axis=1, keepdims=True) for s in scaled]
+    unit = [s / length for s, length in zip(scaled, strength, strict=True)]
     directions = unit if fixed else [d @ view.camera.rotation for d, view in zip(unit, capture.views, strict=True)]
-    return normalised(directions, [length * r for length, r in zip(lengths, ratios, strict=True)], one_rig, fixed)
+    return normalised(directions, [length * r for length, r in zip(strength, ratios, strict=True)], one_rig, fixed)

@@ -23,7 +23,7 @@ from mvps.device import chosen_device
 from mvps.hull import hull_grid, hull_of_masks
 from mvps.joint.refine import refine
 from mvps.joint.thinned import thinned
-from mvps.own_units import in_lengths, own_length
+from mvps.own_units import in_own_units, own_units
 from mvps.photometric import normal_maps
 from mvps.plan import Parts, first_pass
 from mvps.pyramid import levels
@@ -62,7 +62,7 @@ def exponent_left_in(under: Callable[[float], Capture]) -> tuple[float, float] |
 def misfit(capture: Capture, exponent: float) -> float:
     """-log likelihood of a sample of the capture, whose radiances are codes to the power of `exponent`, but for a constant."""
     capture = levels(capture)[-1]
-    capture = in_lengths(capture, own_length([view.camera for view in capture.views]))
+    capture = in_own_units(capture, own_units(capture))
     hull = hull_of_masks(capture, hull_grid(capture))
     # The same wherever the reconstruction runs, that others may undo the same.
     seed, device = 0, chosen_device("cpu")

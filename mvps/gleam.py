@@ -86,9 +86,11 @@ def senders(of: Gather, surface: Surface, law: Law, albedo: Float, weight: Float
 
 
 def shiny(law: Law, albedo: Float, weight: Float) -> bool:
-    """Whether lobes of weights (n, lobes) take a part in what points of albedo (n,) return, that counts."""
+    """Whether lobes of weights (n, lobes) take a part in what points of albedo (n,) return, that counts; points without either are not
+    shown by any view."""
     lobes = weight @ returned(law.sharpness, law.microfacet)[1:]
-    return bool(np.median(lobes / np.maximum(albedo + lobes, 1e-300)) > LEAST_SHARE)
+    known = albedo + lobes > 0
+    return bool(known.any() and np.median(lobes[known] / (albedo + lobes)[known]) > LEAST_SHARE)
 
 
 def patches_of(surface: Surface, lobes: bool) -> Gather:

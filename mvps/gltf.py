@@ -6,7 +6,8 @@ Attributes POSITION, NORMAL (mesh normals), TANGENT (w = 1: bitangent = normal x
 reflection at normal incidence F0 goes into KHR_materials_specular: F0 = 0.04 specularColorFactor specularColorTexture; glTF dims the
 base colour by 1 - max F, for which it is divided by 1 - max F0 beforehand.
 glTF's unit is the metre and its up axis is y; a capture has neither, so coordinates are kept as they are, and the
-material's extras say how albedo follows from the base colour.
+material's extras say how albedo follows from the base colour. Vertices far from the world's origin, which single precision would not
+hold, are measured from their own place, and the node stands there.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from numpy.typing import NDArray
 
 from mvps.atlas import vertex_tangents
 from mvps.mesh import normalise
+from mvps.meshfile import place
 from mvps.texture import Textures
 
 DIELECTRIC = 0.04
@@ -40,11 +42,11 @@ def glb_bytes(textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
 
     pictures: base_color, normal, metallic_roughness and specular as PNG files, in this order.
     """
-    atlas = textures.atlas
+    atlas, stands = textures.atlas, place(textures.surface.vertices)
     normal = normalise(textures.mesh_normal)
     tangent = vertex_tangents(atlas, normal)
     arrays = {
-        "POSITION": textures.surface.vertices[atlas.vertex],
+        "POSITION": (textures.surface.vertices - stands)[atlas.vertex],
         "NORMAL": normal[atlas.vertex],
         "TANGENT": np.concatenate([tangent, np.ones((len(tangent), 1))], 1),
         "TEXCOORD_0": atlas.uv,
@@ -57,7 +59,7 @@ def glb_bytes(textures: Textures, pictures: Mapping[str, bytes]) -> bytes:
         "asset": {"version": "2.0", "generator": "mvps"},
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "name": "model"}],
+        "nodes": [{"mesh": 0, "name": "model"} | ({"translation": stands.tolist()} if stands.any() else {})],
         "meshes": [{"name": "model", "primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
         "materials": [_material(textures)],
         "textures": [{"source": k, "sampler": 0} for k in range(len(images))],

@@ -2,7 +2,8 @@
 
 PLY  little-endian, one element `vertex` (x y z nx ny nz as double, red green blue as uchar) and one element `face`
      (list uchar int vertex_indices). Doubles, so that a mesh read back is the mesh written, bit for bit.
-OBJ  text, nine significant digits (enough for float32); v, vt, vn lines, then faces as v/vt/vn, numbered from 1.
+OBJ  text, nine significant digits (enough for float32; a double's seventeen where `place` is not 0); v, vt, vn lines, then faces as
+     v/vt/vn, numbered from 1.
      vt has its origin at the bottom left, textures here (and glTF) at the top left: v_obj = 1 - v.
 """
 
@@ -85,6 +86,18 @@ def read_ply(path: Path) -> PlyMesh:
     return PlyMesh(positions, normals, colours, face["indices"].astype(np.int64))
 
 
+FAR = 10.0
+"""Sizes of a mesh from the world's origin to its middle, from which on single precision does not hold its shape any more: a hundred
+thousandth of the size is left at 100."""
+
+
+def place(vertices: Float) -> Float:
+    """(3,) the middle of vertices (V, 3) that lie far from the world's origin; 0 of others."""
+    low, high = vertices.min(0), vertices.max(0)
+    middle: Float = (low + high) / 2
+    return middle if np.linalg.norm(middle) > FAR * np.linalg.norm(high - low) else np.zeros(3)
+
+
 def obj_bytes(vertices: Float, normals: Float, uv: Float, faces: Int, uv_faces: Int, material: str) -> bytes:
     """An OBJ file.
 
@@ -94,8 +107,9 @@ def obj_bytes(vertices: Float, normals: Float, uv: Float, faces: Int, uv_faces: 
     out = io.StringIO()
     out.write(f"mtllib {material}.mtl\no {material}\n")
     flipped = np.stack([uv[:, 0], 1 - uv[:, 1]], -1)
+    digits = 17 if place(vertices).any() else 9
     for tag, rows in (("v", vertices), ("vt", flipped), ("vn", normals)):
-        pattern = tag + " %.9g" * rows.shape[1] + "\n"
+        pattern = tag + f" %.{digits}g" * rows.shape[1] + "\n"
         out.write((pattern * len(rows)) % tuple(rows.ravel().tolist()))
     out.write(f"usemtl {material}\n")
     corners = np.stack([faces, uv_faces, faces], -1) + 1

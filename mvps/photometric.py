@@ -47,12 +47,14 @@ def normal_map(view: View, direction: Float, intensity: Float, device: torch.dev
         return torch.tensor(values, dtype=torch.float64, device=device)
 
     noise = float(view.scale / np.mean(intensity))
-    light, per_channel = tensor(direction), tensor(view.scale / intensity)
-    towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels))[1]), view.usable()
+    # Of photographs that were left out nothing is known, least of all that they are bright.
+    shown: slice | list[int] = slice(None) if view.shown.all() else np.flatnonzero(view.shown).tolist()
+    light, per_channel = tensor(direction[shown]), tensor(view.scale / intensity[shown])
+    towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels))[1]), view.usable(shown)
     columns: list[tuple[Tensor, ...]] = []
     for start in range(0, len(view.pixels), PIXELS_PER_CHUNK):
         part = slice(start, start + PIXELS_PER_CHUNK)
-        radiance = torch.from_numpy(view.samples[part].astype(np.float32)).to(device) * per_channel
+        radiance = torch.from_numpy(view.samples[part][:, shown].astype(np.float32)).to(device) * per_channel
         known = torch.from_numpy(usable[part]).to(device).double()
         columns.append(tuple(values.float() for values in pixels_solved(radiance, known, light, towards[part], noise)))
     normal, albedo, confidence = (torch.cat(column).cpu().numpy() for column in zip(*columns, strict=True))

@@ -60,17 +60,22 @@ class PixelSamples:
         return np.where(self.shown, self.absolute, np.nan)
 
 
+FEWEST = 8
+"""Pixels from which factors of four lights start (`FULLEST` in solvers/low_rank.py)."""
+
+
 def pixel_samples(view: View, caster: RayCaster, normal: Float, generator: np.random.Generator) -> PixelSamples:
     """Of pixels of a view drawn among those that meet the surface of `caster`, whose vertices have these normals (V, 3), world frame.
 
-    Raises CaptureError where none meets it.
+    Raises CaptureError where fewer than FEWEST of them meet it.
     """
     chosen = generator.permutation(len(view.pixels))[:PIXELS_PER_VIEW]
     hits = camera_hits(caster, view.camera, view.pixels[chosen])
     on = hits.face >= 0
-    if not on.any():
+    if on.sum() < FEWEST:
+        met = f"{on.sum()} of {len(on)} pixels of its mask meet" if on.any() else "no pixel of its mask meets"
         raise CaptureError(
-            f"{view.name}: wanted a camera that sees what all masks enclose, given one from which no pixel of its mask meets it;"
+            f"{view.name}: wanted a camera that sees what all masks enclose, given one from which {met} it;"
             " check this view's rotation, translation and mask, or leave it out with --views"
         )
     chosen, hits = chosen[on], Hits(hits.face[on], hits.barycentric[on], hits.distance[on])

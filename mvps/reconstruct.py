@@ -116,7 +116,7 @@ def reconstruct(
     from mvps.device import chosen_device
     from mvps.joint.pixels import few_lights
     from mvps.material import POOR_FIT
-    from mvps.own_units import in_lengths, in_world_units, own_length
+    from mvps.own_units import in_own_units, in_world_units, own_units
     from mvps.passes import stage_two
     from mvps.plan import Parts, last_pass
     from mvps.pyramid import halvings
@@ -129,10 +129,10 @@ def reconstruct(
         from mvps.oneview import reconstruct_view
 
         return reconstruct_view(capture, used, held, settings, lights, parts, progress, findings)
-    length = own_length([view.camera for view in used.views])
+    own = own_units(used)
     given = lights and lights_in(lights, capture, used)
-    capture, used = in_lengths(capture, length), in_lengths(used, length)
-    held = held and in_lengths(held, length)
+    capture, used = in_own_units(capture, own), in_own_units(used, own)
+    held = held and in_own_units(held, own)
     rest = without_thin_parts(used, progress)
 
     def step(name: str, make: Callable[[], Any]) -> Any:
@@ -159,7 +159,7 @@ def reconstruct(
         complete = all_lights(capture, used, held, refined.lights, refined.surface, refined.material, device, lights)
         pictures = normal_pictures(capture, used, refined)
     result = told(capture, used, asdict(settings), refined, complete, pictures, rounds + refined.rounds, progress, [*findings, *lacking])
-    return in_world_units(result, length)
+    return in_world_units(result, own)
 
 
 def write(reconstruction: Reconstruction, capture: Capture, settings: Settings, out: Path, progress: Progress) -> None:

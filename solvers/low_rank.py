@@ -69,16 +69,23 @@ def robust_weights(residual: NDArray[Any], known: NDArray[Any], floor: float) ->
     return weights
 
 
+FULLEST = 2
+"""Times the rank: the least number of rows, those with most known entries, that factors start from."""
+
+
 def factorise(M: NDArray[Any], known: NDArray[Any], rank: int, sweeps: int = 20, floor: float = 0.0) -> Factorisation:
     """Robust factors of M (m, n), entries with known = 0 ignored; rows should have comparable scale.
 
-    floor is the noise level of an entry: no robust scale goes below it. Raises ValueError where M has fewer columns than rank.
+    floor is the noise level of an entry: no robust scale goes below it. Raises ValueError where M has fewer columns or rows than rank.
     """
-    if M.shape[1] < rank:
-        raise ValueError(f"factorise: wanted at least {rank} columns, given {M.shape[1]}")
+    for side, given in zip(("rows", "columns"), M.shape, strict=True):
+        if given < rank:
+            raise ValueError(f"factorise: wanted at least {rank} {side}, given {given}")
     known = known.astype(np.float64)
     fullness = known.mean(1)
     complete = fullness >= min(1.0, float(np.quantile(fullness, 0.9)))
+    if complete.sum() < FULLEST * rank:
+        complete = np.isin(np.arange(len(M)), np.argsort(-fullness, kind="stable")[: FULLEST * rank])
     _, s, Vt = np.linalg.svd(np.where(known > 0, M, 0)[complete], full_matrices=False)
     right = Vt[:rank].T * s[:rank] / np.sqrt(complete.sum())
     W = known

@@ -281,3 +281,59 @@ def test_lights_of_which_nothing_is_known_stand_at_the_camera(nothing: float) ->
     np.testing.assert_array_equal(none, [toward] * 3)
     some = calibrate.without_gaps(np.array([[0.0, 2.0, 0.0], [nothing] * 3]))
     np.testing.assert_array_equal(some, [[0, 2, 0], [0, 0, -2]])
+
+
+@pytest.mark.parametrize("seed", [None, 3])
+def test_a_view_of_few_lights_leaves_the_others_theirs(scene: SphereScene, seed: int | None) -> None:
+    capture, truth, surface = lambertian(scene, seed)
+    keep = {view.name: view.lights for view in capture.views}
+    first = capture.views[0].name
+    found = uncalibrated_lights(capture.select(keep | {first: (1, 2, 3)}), surface, 0).lights
+    others = uncalibrated_lights(capture.select({name: of for name, of in keep.items() if name != first}), surface, 0).lights
+    for a, b, e, f in zip(found.direction[1:], others.direction, found.intensity[1:], others.intensity, strict=True):
+        np.testing.assert_array_equal(a, b)
+        assert np.ptp(e / f) < 1e-9
+    assert not found.one_rig and light_error(replace(found, direction=found.direction[1:], intensity=found.intensity[1:]), others) < 1e-6
+    assert degrees(found.direction[0], truth.direction[0][:3]).mean() < 10
+    stronger = [e.mean(1) / f.mean(1)[: len(e)] for e, f in zip(found.intensity, truth.intensity, strict=True)]
+    # One albedo stands for both, 0.7 and 0.4.
+    assert 4 / 7 < np.median(stronger[0]) / np.median(np.concatenate(stronger[1:])) < 7 / 4
+
+
+@pytest.mark.parametrize("exposure", [1.0, 1 / 16])
+def test_photographs_that_were_left_out_count_as_none(scene: SphereScene, exposure: float) -> None:
+    capture, lights, _ = lambertian(scene)
+    view = capture.views[0]
+    dark = replace(view, samples=np.rint(exposure * view.samples).astype(np.uint16))
+    kept = Capture("dark", (dark,)).without({view.name: (2, 5, 7)}).views[0]
+    others = [n - 1 for n in view.lights if n not in (2, 5, 7)]
+    alone = replace(dark, samples=dark.samples[:, others], lights=tuple(n + 1 for n in others))
+    given = lights.direction[0], lights.intensity[0]
+    found, wanted = normal_map(kept, *given, CPU), normal_map(alone, *(of[others] for of in given), CPU)
+    assert (found.confidence > 0.5).mean() > 0.8 and np.median(degrees(found.normal, ball_normals(view))) < 0.5
+    assert np.median(degrees(found.normal, wanted.normal)) < 0.05
+
+
+def test_colours_of_a_rig_are_those_of_views_that_show_a_light(scene: SphereScene) -> None:
+    capture, truth, _ = lambertian(scene)
+    ratio = truth.intensity[0] / truth.intensity[0].mean(1, keepdims=True)
+    gone = capture.without({view.name: (1,) for view in capture.views[:-1]})
+    for given in (capture, gone):
+        found = calibrate._assemble(given, [truth.direction[0] @ given.views[0].camera.rotation.T] * len(given.views), True).intensity[0]
+        assert np.abs(found[0] / found[0].mean() / ratio[0] - 1).max() < 0.2
+    nowhere = capture.without({view.name: (1,) for view in capture.views})
+    found = calibrate._assemble(nowhere, [truth.direction[0]] * len(nowhere.views), True).intensity[0]
+    assert np.ptp(found[0]) == 0
+
+
+def test_a_view_that_hardly_shows_the_object_is_named(scene: SphereScene) -> None:
+    capture, _, surface = lambertian(scene, 3)
+    first = capture.views[0]
+    for count in (3, 12, 20):
+        mask = np.zeros_like(first.mask)
+        mask[tuple(first.pixels[len(first.pixels) // 2 :][:count].T)] = True
+        small = replace(first, mask=mask, samples=first.samples[mask[first.mask]])
+        try:
+            uncalibrated_lights(Capture("small", (small, *capture.views[1:])), surface, 0)
+        except CaptureError as error:
+            assert ("3 of 3 pixels" if count == 3 else "point many ways") in str(error)

@@ -21,7 +21,7 @@ from mvps.folders import appearing_whole
 from mvps.mesh import decimated
 from mvps.meshfile import read_ply
 from mvps.pbr import reflectance_scale
-from mvps.scene import CaptureError, Material, Reconstruction, Truth
+from mvps.scene import CaptureError, Material, Reconstruction, Surface, Truth
 from mvps.texture import Textures, bake
 from mvps.visibility import camera_hits, interpolate, ray_caster
 
@@ -212,6 +212,25 @@ def test_the_benchmark_reads_the_normals_that_the_model_holds(
     monkeypatch.setattr("model_normals.read_capture", lambda *_, **__: scene.capture)
     errors = model_normal_errors(folder / "model.glb", capture)
     assert errors["model_normal_error_deg"] < 1 < 3 < errors["model_normal_error_without_map_deg"]
+
+
+def test_a_model_far_from_the_world_s_origin_keeps_its_shape(
+    scene: SphereScene, textures: Textures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Single precision has steps of half a metre there, a hundredth of the object."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from glb import read_glb
+
+    vertices = scene.reconstruction.surface.vertices + np.array([4e6, 5e6, 300])
+    surface = Surface(vertices, scene.reconstruction.surface.faces)
+    away = replace(scene.reconstruction, surface=surface)
+    write_reconstruction(away, tmp_path / "out", replace(textures, surface=surface), "")
+    for mesh in (
+        trimesh.load_scene(tmp_path / "out" / "model.glb", process=False).to_mesh(),
+        trimesh.load(tmp_path / "out" / "model.obj", process=False),
+    ):
+        assert np.abs(mesh.triangles - vertices[surface.faces]).max() < 1e-5
+    assert np.abs(read_glb(tmp_path / "out" / "model.glb").position - vertices[textures.atlas.vertex]).max() < 1e-5
 
 
 def test_obj_read_back_by_trimesh(scene: SphereScene, textures: Textures, folder: Path) -> None:

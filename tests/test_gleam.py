@@ -219,6 +219,9 @@ def test_lobes_count_where_they_return_a_quarter() -> None:
     assert shiny(law, albedo, 1.01 * quarter) and not shiny(law, albedo, 0.99 * quarter)
     assert not shiny(Law(()), albedo, np.zeros((5, 0)))
     assert not shiny(law, np.zeros(5), np.zeros((5, 1)))
+    # What no view shows does not count.
+    unseen = np.zeros(7)
+    assert shiny(law, np.append(albedo, unseen), np.append(1.01 * quarter, unseen[:, None], 0))
 
 
 def test_colours_of_lobes_are_sent_channel_by_channel() -> None:

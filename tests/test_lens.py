@@ -108,6 +108,13 @@ def test_clipped_samples_stay_clipped(clean: Capture) -> None:
     assert not after.usable([1]).any() and after.usable([0]).all()
 
 
+def test_what_is_clipped_lower_is_no_brighter_than_that(clean: Capture) -> None:
+    view = with_lens(clean, 3.0).views[0]
+    view = replace(view, samples=np.minimum(view.samples, 4095), saturation=4095)
+    after = straightened(view)
+    assert not view.usable().all() and not after.usable().all() and after.samples.max() == 4095
+
+
 def test_true_normals_of_photographs_that_show_the_lens_are_straightened(tmp_path: Path) -> None:
     clean, truth = render_capture(SceneSettings(views=1, lights=2, size=96))
     given = through_lens(clean, 3.0)

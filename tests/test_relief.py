@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from mvps.relief.ambiguity import factors, resolved
 from mvps.relief.integrate import integrate
 from mvps.relief.silhouette import inflated_normals
 from mvps.relief.surface import pixel_surface
-from mvps.scene import Camera, View
+from mvps.scene import Camera, Capture, View
 from mvps.visibility import camera_hits, ray_caster
 
 SIZE = 64
@@ -146,3 +147,12 @@ def test_the_ambiguity_is_resolved_for_a_lambertian_body_of_two_albedos() -> Non
 
     assert error(start) > 10
     assert error(resolved(view, pseudo, rough, start, generator)) < 2.5
+
+
+def test_photographs_that_were_left_out_are_not_bright() -> None:
+    mask, normal = bumpy()
+    view, _ = photographed(mask, normal, np.full(len(normal), 0.5), 12, 0)
+    dark = replace(view, samples=view.samples // 15)
+    left = Capture("dark", (dark,)).without({"view_01": (2, 5, 7)}).views[0]
+    shown = factors(left, np.random.default_rng(1)), factors(dark, np.random.default_rng(1))
+    assert np.median(shown[0].bright / shown[1].bright) == pytest.approx(1, abs=0.1)

@@ -13,7 +13,7 @@ import trimesh
 from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices
 from mvps.joint.grey import grey_lights
-from mvps.joint.lights import light_step, subset, told_by_shadows
+from mvps.joint.lights import _most_returned, light_step, subset, told_by_shadows
 from mvps.joint.observe import ViewSamples, observe, with_gathered
 from mvps.joint.patches import Patches, drawn_patches
 from mvps.joint.photometry import Task, photometric_round
@@ -237,3 +237,14 @@ def test_inter_reflection_is_kept_where_shadows_hold_light(seen: Seen) -> None:
     (_, dark), (_, told) = errors
     assert np.nanmedian(dark) == 1 and np.nanmedian(told) < 0.1
     assert presumed("inter-reflection", *(np.stack(of_both) for of_both in errors)).kept
+
+
+def test_the_strength_is_bounded_by_what_views_show(seen: Seen) -> None:
+    """Of a surface of which more than half is seen by none, too."""
+    vertices, n = seen.vertices, len(seen.vertices.normal)
+    wide = replace(
+        vertices, normal=vertices.normal.repeat(3, 1), reflectance=torch.cat([vertices.reflectance, 0 * vertices.reflectance.repeat(2, 1)])
+    )
+    assert len(wide.reflectance) == 3 * n
+    assert _most_returned(DIFFUSE, wide) == pytest.approx(_most_returned(DIFFUSE, vertices))
+    assert _most_returned(DIFFUSE, replace(vertices, reflectance=0 * vertices.reflectance)) == np.inf

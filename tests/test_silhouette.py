@@ -13,7 +13,7 @@ from mvps.joint.agreement import Agreement
 from mvps.joint.refine import POSITION_FLOOR_PIXELS
 from mvps.joint.vertices import with_masks
 from mvps.mesh import normalise, unbiased
-from mvps.scene import Camera, Capture, Surface
+from mvps.scene import Camera, Capture, Surface, View
 from mvps.silhouette import mask_distance, mask_distances, outline, sampled
 from mvps.visibility import RayCaster
 
@@ -89,6 +89,22 @@ def test_masks_bring_a_ball_to_its_size() -> None:
         known = np.isfinite(told.sigma)
         assert known.sum() > 300 and abs(told.offset[known].mean() - (1 - factor) * RADIUS) < 0.1
         assert np.abs(told.offset[known] - (1 - factor) * RADIUS).max() < 0.6
+
+
+def test_masks_say_nothing_of_outlines_beyond_the_frame() -> None:
+    """A view's right third is cut off: no vertex is told to go there, and those that are seen keep their places."""
+    view = make_sphere(5).capture.views[0]
+    camera = view.camera
+    right = camera.width * 2 // 3
+    cut = Camera(camera.K, camera.rotation, camera.translation, camera.height, right)
+    mask = view.mask[:, :right]
+    part = View(view.name, cut, mask, np.zeros((int(mask.sum()), 1, 3), np.uint16), view.scale, view.saturation, (1,))
+    nothing = Agreement(np.zeros(len(BALL.vertices)), np.full(len(BALL.vertices), np.inf))
+    capture = Capture("cut", (part,))
+    told = with_masks(nothing, capture, BALL, mask_distances(capture), POSITION_FLOOR_PIXELS)
+    known = np.isfinite(told.sigma)
+    assert known.sum() > 50 and np.abs(told.offset[known]).max() < 0.02 * RADIUS
+    assert project(camera, BALL.vertices[known])[0][:, 0].max() < right + 1
 
 
 def test_distances_between_pixel_centres() -> None:

@@ -14,6 +14,7 @@ from scipy.ndimage import binary_dilation, binary_erosion
 import mvps.checks.silhouettes
 from mvps.checks.silhouettes import silhouettes
 from mvps.load import read_capture
+from mvps.own_units import object_place
 from mvps.scene import Bool, Camera, Capture, View
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
@@ -187,3 +188,19 @@ def test_what_the_image_cuts_off_is_no_contradiction(sound: Capture) -> None:
 
     views = tuple(cut(view) if k == 0 else view for k, view in enumerate(sound.views))
     assert silhouettes(Capture("cut", views))[1] == []
+
+
+@pytest.mark.parametrize("away", [0.0, 1000.0])
+def test_cameras_side_by_side_are_no_twins_however_far_from_the_origin(sound: Capture, away: float) -> None:
+    first = sound.views[0]
+    place, size = object_place(sound)
+    camera = first.camera
+    aside = replace(camera, translation=camera.translation + np.array([0.05 * size, 0, 0]))
+    moved = replace(first, camera=aside, mask=np.roll(first.mask, 6, 1), name="view_02")
+
+    def from_afar(view: View) -> View:
+        return view.taken_by(replace(view.camera, translation=view.camera.translation - view.camera.rotation @ np.full(3, away * size)))
+
+    there = place + away * size
+    assert not mvps.checks.silhouettes._twins([from_afar(first), from_afar(moved)], there)
+    assert mvps.checks.silhouettes._twins([from_afar(first), from_afar(replace(moved, camera=camera))], there)

@@ -173,3 +173,15 @@ def test_a_matrix_that_rounding_made_indefinite_still_gives_a_step_down() -> Non
     assert torch.isfinite(step).all() and step @ gradient > 0
     torch.testing.assert_close(semidefinite @ step, gradient, rtol=1e-3, atol=1e-3)
     assert (damped_solution(torch.full((2, 2), torch.nan, dtype=torch.float64), gradient[:2]) == 0).all()
+
+
+def test_few_rows_of_which_one_is_complete_have_factors_too() -> None:
+    M = low_rank(4, rows=8, columns=6)
+    known = np.ones(M.shape, bool)
+    known[1:, 5] = False
+    known[2, 1] = False
+    factors = factorise(np.where(known, M, 1e3), known, 3, sweeps=60)
+    assert factors.right.shape == (6, 3) and len(factors.singular_values) == 6
+    assert np.abs(factors.left @ factors.right.T - M)[known].max() < 1e-2 * np.abs(M).max()
+    with pytest.raises(ValueError, match="wanted at least 3 rows, given 2"):
+        factorise(M[:2], known[:2], 3)

@@ -78,6 +78,6 @@ def straightened(view: View) -> View:
         image[view.mask] = np.column_stack([view.samples[:, k], ~usable[:, k]])
         found = at(image)[mask]
         samples[:, k] = np.rint(found[:, :3] / share[mask][:, None])
-        samples[found[:, 3] > 0, k] = np.iinfo(np.uint16).max
+        samples[found[:, 3] > 0, k] = view.saturation
     frame = None if view.frame is None else at(view.frame)
     return replace(view, camera=replace(view.camera, distortion=()), mask=mask, samples=samples, frame=frame, files=())

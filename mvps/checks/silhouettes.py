@@ -28,7 +28,8 @@ from mvps.cores import on_cores
 from mvps.finding import Finding
 from mvps.load import with_mask
 from mvps.material import CERTAIN
-from mvps.scene import Bool, Capture, View
+from mvps.own_units import object_place
+from mvps.scene import Bool, Capture, Float, View
 
 FEWEST = 3
 """Views that can contradict one another: of two, either may be wrong."""
@@ -158,7 +159,7 @@ def _left_out(cones: Cones) -> tuple[Capture, list[Finding]]:
         )
         findings.append(Finding("pose", names[among.pop(best)], text, True))
         counts = left[best]
-    for pair in _twins([capture.views[at] for at in among]):
+    for pair in _twins([capture.views[at] for at in among], object_place(capture)[0]):
         both = [names.index(view.name) for view in pair]
         if not {*both} <= {*among}:
             continue
@@ -203,14 +204,16 @@ def _wrong(cones: Cones, among: Sequence[int], suspects: Sequence[int]) -> int |
     return best if misfit(misses[best]) <= DOUBTFUL_PIXELS and fall > CERTAIN * error else None
 
 
-def _twins(views: Sequence[View]) -> list[tuple[View, View]]:
-    """Pairs of views whose cameras are the same to a pixel and whose masks differ by more than their outlines' staircase."""
+def _twins(views: Sequence[View], place: Float) -> list[tuple[View, View]]:
+    """Pairs of views whose cameras are the same to a pixel at the object's place (3,) and whose masks differ by more than their outlines'
+    staircase."""
     pairs = []
     for at, one in enumerate(views):
         for other in views[at + 1 :]:
             a, b = one.camera, other.camera
-            depth = float(np.linalg.norm(a.translation))
-            moved = max(np.abs(a.translation - b.translation).max(), depth * np.abs(a.rotation - b.rotation).max()) * a.focal_length / depth
+            first, second = (camera.rotation @ place + camera.translation for camera in (a, b))
+            depth = max(float(np.linalg.norm(first)), np.finfo(float).tiny)
+            moved = max(np.abs(first - second).max(), depth * np.abs(a.rotation - b.rotation).max()) * a.focal_length / depth
             if moved < 1 and one.mask.shape == other.mask.shape and binary_opening(one.mask ^ other.mask, BLOCK).sum() > ENOUGH:
                 pairs.append((one, other))
     return pairs

@@ -390,9 +390,10 @@ def _bounded(law: Law, grazing: float, bounce: float, gleam: float, vertices: Ve
 
 
 def _most_returned(law: Law, vertices: Vertices) -> float:
-    """The strength at which the median point returns as much light as it receives."""
+    """The strength at which the median point, of those that some view shows, returns as much light as it receives."""
     reflected = vertices.reflectance @ vertices.reflectance.new_tensor(returned(law.sharpness, law.microfacet))
-    return 1 / max(float(reflected.median()), 1e-300)
+    known = reflected[reflected > 0]
+    return 1 / float(known.median()) if len(known) else float("inf")
 
 
 def with_mean_one(lights: list[DirectionalLights], vertices: Vertices) -> tuple[list[DirectionalLights], Vertices]:

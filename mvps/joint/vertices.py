@@ -22,6 +22,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
+from mvps.camera import inside_image
 from mvps.cores import on_cores
 from mvps.joint.agreement import Agreement
 from mvps.mesh import corners, cross, face_areas, face_normals, vertex_normals
@@ -70,10 +71,14 @@ def with_masks(agreed: Agreement, capture: Capture, surface: Surface, distance: 
     count = len(surface.vertices)
 
     def of_view(i: int) -> tuple[Float, Float]:
-        line = outline(caster, capture.views[i].camera)
-        here, beyond, before = (sampled(distance[i], line.image + step * line.outward) for step in (0, 1, -1))
+        camera = capture.views[i].camera
+        line = outline(caster, camera)
+        across = [line.image + step * line.outward for step in (0, 1, -1)]
+        here, beyond, before = (sampled(distance[i], at) for at in across)
         slope = (beyond - before) / 2
-        told = slope > ALONG
+        # Of outlines beyond the frame a mask says nothing.
+        on = [inside_image(camera, at) for at in across]
+        told = (slope > ALONG) & on[0] & on[1] & on[2]
         weight = told * line.length * SHARED * (line.rate / MASK_SIGMA_PIXELS) ** 2
         wanted = -here / np.where(told, slope, 1) / np.where(line.rate > 0, line.rate, 1)
         corners, shares = surface.faces[line.face].ravel(), weight[:, None] * line.barycentric
