@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
+from mvps.command import not_ended
 from mvps.scene import CaptureError
 
 RESULT_MARKS = ("settings.json", "mesh.ply")
@@ -34,19 +35,25 @@ def appearing_whole(folder: Path, marks: tuple[str, ...] = (), unfinished: str =
         yield writing
         # Someone may have put something there in the meantime.
         check_place(place, marks, unfinished)
-        if not place.exists():
-            writing.rename(place)
-            return
-        place.rename(aside)
-        try:
-            writing.rename(place)
-        except OSError:
-            aside.rename(place)
-            raise
-        shutil.rmtree(aside)
+        with not_ended():
+            _put(writing, place, aside)
     finally:
         if writing.exists():
             shutil.rmtree(writing)
+
+
+def _put(writing: Path, place: Path, aside: Path) -> None:
+    """A finished folder in its place; what was there goes aside until it is."""
+    if not place.exists():
+        writing.rename(place)
+        return
+    place.rename(aside)
+    try:
+        writing.rename(place)
+    except OSError:
+        aside.rename(place)
+        raise
+    shutil.rmtree(aside)
 
 
 def replaced(path: Path, write: Callable[[BinaryIO], object]) -> None:

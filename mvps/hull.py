@@ -20,7 +20,7 @@ from skimage.measure import marching_cubes
 
 from mvps.camera import pixel_footprint, project
 from mvps.cores import on_cores
-from mvps.mesh import largest_pieces, piece_count
+from mvps.mesh import chosen_pieces, face_areas, labelled_pieces, largest_pieces
 from mvps.once import once_for
 from mvps.scene import Bool, Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
 from mvps.silhouette import beyond_mask, mask_distances
@@ -186,17 +186,29 @@ def hull_grid(capture: Capture) -> SignedDistanceGrid:
 
 @once_for
 def hull_of_masks(capture: Capture, grid: SignedDistanceGrid) -> Surface:
-    """The hull with all pieces that masks ask for: the largest, and the next as long as it alone covers a share ALONE of the masks. What
-    masks do not ask for are cells of noise, and ghosts where the cones of several parts meet."""
+    """The hull with all pieces that masks ask for: the largest, and others, the one that covers most of them first, as long as it
+    alone covers a share ALONE of the masks. What masks do not ask for are cells of noise, and ghosts where cones of several parts meet."""
     whole = _level_set(grid)
-    asked = int(sum(view.mask.sum() for view in capture.views))
-    kept = largest_pieces(whole)
-    for count in range(2, piece_count(whole) + 1):
-        more = largest_pieces(whole, count)
-        if covered(more, capture) - covered(kept, capture) < ALONE * asked:
+    asked = ALONE * int(sum(view.mask.sum() for view in capture.views))
+    label, order = labelled_pieces(whole)
+    area = np.bincount(label, face_areas(whole))
+    # A closed piece shows a camera half of its area at most, and twice as near as the middle four times as many pixels.
+    pixel = pixel_footprint([view.camera for view in capture.views], whole.vertices.mean(0))
+    others = [k for k in order[1:] if 4 * len(capture.views) * area[k] / 2 > asked * pixel**2]
+    kept = [order[0]]
+
+    def with_also(k: int) -> int:
+        return covered(chosen_pieces(whole, label, [*kept, k]), capture)
+
+    before = covered(chosen_pieces(whole, label, kept), capture) if others else 0
+    while others:
+        gains = [with_also(k) - before for k in others]
+        best = int(np.argmax(gains))
+        if gains[best] < asked:
             break
-        kept = more
-    return kept
+        before += gains[best]
+        kept.append(others.pop(best))
+    return chosen_pieces(whole, label, kept)
 
 
 def covered(surface: Surface, capture: Capture) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -162,7 +163,7 @@ def without_unused_vertices(surface: Surface) -> Surface:
     return Surface(surface.vertices[used], inverse.reshape(-1, 3))
 
 
-def _pieces(surface: Surface) -> tuple[Int, Int]:
+def labelled_pieces(surface: Surface) -> tuple[Int, Int]:
     """Of each face the number of its connected component, and these numbers from the largest area to the smallest."""
     n, pairs = len(surface.vertices), edges(surface)
     graph = sp.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
@@ -174,19 +175,24 @@ def _pieces(surface: Surface) -> tuple[Int, Int]:
 
 def piece_count(surface: Surface) -> int:
     """How many connected components the faces make."""
-    return len(_pieces(surface)[1])
+    return len(labelled_pieces(surface)[1])
 
 
 def pieces_of(surface: Surface) -> list[Surface]:
     """The connected components, from the largest area to the smallest."""
-    label, order = _pieces(surface)
+    label, order = labelled_pieces(surface)
     return [without_unused_vertices(Surface(surface.vertices, surface.faces[label == k])) for k in order]
 
 
 def largest_pieces(surface: Surface, count: int = 1) -> Surface:
     """The `count` connected components with the largest areas."""
-    label, order = _pieces(surface)
-    return without_unused_vertices(Surface(surface.vertices, surface.faces[np.isin(label, order[:count])]))
+    label, order = labelled_pieces(surface)
+    return chosen_pieces(surface, label, order[:count])
+
+
+def chosen_pieces(surface: Surface, label: Int, numbers: Sequence[int] | Int) -> Surface:
+    """The connected components of these numbers; label (F,): of each face its component's (`labelled_pieces`)."""
+    return without_unused_vertices(Surface(surface.vertices, surface.faces[np.isin(label, numbers)]))
 
 
 def split_edges(surface: Surface, marked: Bool) -> Surface:

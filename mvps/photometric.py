@@ -48,7 +48,7 @@ def normal_map(view: View, direction: Float, intensity: Float, device: torch.dev
 
     noise = float(view.scale / np.mean(intensity))
     # Of photographs that were left out nothing is known, least of all that they are bright.
-    shown: slice | list[int] = slice(None) if view.shown.all() else np.flatnonzero(view.shown).tolist()
+    shown: slice | list[int] = slice(None) if view.shown.all() or not view.shown.any() else np.flatnonzero(view.shown).tolist()
     light, per_channel = tensor(direction[shown]), tensor(view.scale / intensity[shown])
     towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels))[1]), view.usable(shown)
     columns: list[tuple[Tensor, ...]] = []

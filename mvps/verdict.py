@@ -112,7 +112,7 @@ def photographs(capture: Capture, surface: Surface, seen: Sequence[Int]) -> floa
     """`photographs` above, where views see the vertices `seen`."""
     count = np.zeros(len(surface.vertices), np.int64)
     for view, index in zip(capture.views, seen, strict=True):
-        count[index] += len(view.lights)
+        count[index] += int(view.shown.sum())
     return median(count[count > 0].astype(float), vertex_areas(surface)[count > 0])
 
 

@@ -70,7 +70,10 @@ def drawn_to_surface(capture: Capture, surface: Surface, pictures: list[Picture]
     caster = ray_caster(surface)
     views = on_cores(lambda view, picture: _shown(caster, view, picture), capture.views, pictures)
     towards = normalise(np.array([view.camera.centre for view in capture.views]) - surface.vertices.mean(0))
-    nearest = np.argsort(-(towards @ towards.T), axis=1, kind="stable")[:, 1 : 1 + OTHERS]
+    alike = towards @ towards.T
+    # Of two views from one side neither is the other, and none is its own.
+    np.fill_diagonal(alike, -np.inf)
+    nearest = np.argsort(-alike, axis=1, kind="stable")[:, : min(OTHERS, len(views) - 1)]
     told = on_cores(lambda i: _products(surface, views[i], [views[j] for j in nearest[i]]), range(len(views)))
     products, trust = (np.concatenate(parts) for parts in zip(*told, strict=True))
     hits = [one.hits for one in views]

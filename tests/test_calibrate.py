@@ -12,6 +12,7 @@ from sphere_scene import RADIUS, SphereScene, camera_at, make_sphere
 
 from mvps import calibrate
 from mvps.calibrate import solve_ambiguity, uncalibrated_lights
+from mvps.camera import pixel_centres, rays
 from mvps.hull import default_cells, hull_of_masks, masks_box, signed_distance, visual_hull
 from mvps.mesh import normalise, piece_count, vertex_normals
 from mvps.photometric import normal_map
@@ -90,6 +91,33 @@ def test_a_second_piece_stays_if_masks_ask_for_it(radius: float, count: int) -> 
     assert piece_count(hull_of_masks(capture, grid)) == count and piece_count(visual_hull(grid)) == 1
 
 
+def test_a_ghost_larger_than_a_part_does_not_hide_it() -> None:
+    """Three balls in four views: where cones of the two large ones meet, the hull has a piece that is larger than the small ball."""
+    draw = np.random.default_rng(21)
+    draw.integers(3, 7)
+    balls: list[tuple[np.ndarray, float]] = []
+    for radius in (0.8, 0.8, 0.25):
+        while True:
+            place = draw.uniform(-1.6, 1.6, 3) * [1, 0.4, 1]
+            if all(np.linalg.norm(place - other) > radius + r + 0.3 for other, r in balls):
+                balls.append((place, radius))
+                break
+    made, first = [], draw.uniform(0, 1)
+    for k in range(4):
+        angle = first + np.pi / 2 * k
+        camera = camera_at(np.array([12 * np.sin(angle), 2.0, 12 * np.cos(angle)]), 96, 12.0)
+        camera = replace(camera, K=np.array([[220.0, 0, 48], [0, 220, 48], [0, 0, 1]]))
+        start, along = rays(camera, pixel_centres(np.indices((96, 96)).reshape(2, -1).T))
+        mask = np.zeros(len(start), bool)
+        for place, radius in balls:
+            nearest = start + ((place - start) * along).sum(1, keepdims=True) * along
+            mask |= ((nearest - place) ** 2).sum(1) < radius**2
+        made.append(View(f"view_{k + 1:02d}", camera, mask.reshape(96, 96), np.zeros((int(mask.sum()), 1, 3), np.uint16), 1.0, 65535, (1,)))
+    capture = Capture("three", tuple(made))
+    hull = hull_of_masks(capture, signed_distance(capture, 96))
+    assert all(np.linalg.norm(hull.vertices - place, axis=1).min() < 1.3 * radius for place, radius in balls)
+
+
 def test_masks_of_different_places_have_no_common_part() -> None:
     capture = discs(6)
     moved = [
@@ -130,8 +158,6 @@ def lambertian(scene: SphereScene, seed: int | None = None, right: float = 0.4, 
 
 def ball_normals(view: View) -> np.ndarray:
     """Exact normals (pixels, 3) of the sphere under a view's pixels."""
-    from mvps.camera import pixel_centres, rays
-
     origin, direction = rays(view.camera, pixel_centres(view.pixels))
     along = -(origin * direction).sum(1)
     miss = np.maximum(RADIUS**2 - ((origin + along[:, None] * direction) ** 2).sum(1), 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -296,6 +297,28 @@ def test_an_interrupted_write_leaves_the_earlier_result(folder: Path, scene: Sph
     with pytest.raises(KeyboardInterrupt):
         write_reconstruction(replace(scene.reconstruction, settings={"seed": 1}), folder)
     assert contents(folder) == before and list(folder.parent.iterdir()) == [folder]
+
+
+def test_a_request_to_end_while_results_change_places_waits_for_the_new_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "result").mkdir()
+    (tmp_path / "result" / "mark").write_text("old")
+    rename = Path.rename
+
+    def interrupted(path: Path, to: Path) -> Path:
+        moved = rename(path, to)
+        if str(to).endswith("replaced"):
+            signal.raise_signal(signal.SIGINT)
+        return moved
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    # Whoever runs the tests in the background may have let them ignore this signal.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), appearing_whole(tmp_path / "result", ("mark",)) as folder:
+            (folder / "mark").write_text("new")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert [p.name for p in tmp_path.iterdir()] == ["result"] and (tmp_path / "result" / "mark").read_text() == "new"
 
 
 def test_a_failing_rename_puts_the_earlier_result_back(folder: Path, scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:

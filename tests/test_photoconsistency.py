@@ -71,6 +71,16 @@ def test_photographs_agree_where_the_surface_is(texture: float, lights: int) -> 
     assert told.mean() > 0.8 and abs(np.median(found.offset[told]) - TOO_SMALL) < 0.05
 
 
+def test_photographs_that_were_left_out_are_not_asked() -> None:
+    material = painted(0.8)
+    capture, lights, surface = photographed(material, 7)
+    # Every third of seven, from the first on, is asked otherwise.
+    less = capture.without({view.name: [view.lights[k] for k in (0, 2, 4)] for view in capture.views})
+    found = agreed(less, lights, surface, material)
+    told = np.isfinite(found.sigma)
+    assert told.mean() > 0.8 and abs(np.median(found.offset[told]) - TOO_SMALL) < 0.05
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_photographs_without_a_usable_value_say_nothing() -> None:
     material = painted(0.8)

@@ -60,6 +60,23 @@ def test_a_tilted_plane_is_exact_under_perspective() -> None:
     assert depth_error_px(made.log_depth, depth * np.sign(depth[0])).max() < 0.05
 
 
+@pytest.mark.parametrize("confidence", [1.0, 0.05])
+def test_a_wave_as_long_as_a_large_photograph_keeps_its_height(confidence: float) -> None:
+    """A cylinder's strip of 6000 pixels, one wave across."""
+    height, width, high = 3, 6000, 0.05
+    f = 3.0 * width
+    camera = Camera(np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]]), np.eye(3), np.zeros(3), height, width)
+    mask = np.ones((height, width), bool)
+    ray = np.concatenate([pixel_centres(np.argwhere(mask)), np.ones((height * width, 1))], 1) @ np.linalg.inv(camera.K).T
+    phase = 2 * np.pi * pixel_centres(np.argwhere(mask))[:, 0] / width
+    slope = -high * 2 * np.pi / width * np.sin(phase)
+    normal = normalise(np.cross(slope[:, None] * ray + [1 / f, 0, 0], np.broadcast_to([0, 1 / f, 0], ray.shape)))
+    normal *= -np.sign((normal * ray).sum(1, keepdims=True))
+    wave = high * (np.cos(phase) - np.cos(phase).mean())
+    found = integrate(camera, mask, normal, np.full(len(normal), confidence)).log_depth
+    assert (found * wave).sum() / (wave**2).sum() == pytest.approx(1, abs=0.005)
+
+
 FAR = Camera(np.array([[6e5, 0, 32], [0, 6e5, 32], [0, 0, 1]]), np.eye(3), np.zeros(3), SIZE, SIZE)
 """Nearly orthographic."""
 

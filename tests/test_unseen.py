@@ -78,3 +78,12 @@ def test_an_unseen_back_stays_behind_what_is_seen(monkeypatch: pytest.MonkeyPatc
 def test_nothing_unseen_or_nothing_seen_changes_nothing() -> None:
     for seen in (np.ones(len(SEEN), bool), np.zeros(len(SEEN), bool)):
         assert closed_over(BALL, in_views(seen), SCENE.capture, DISTANCE) is BALL
+
+
+def test_a_piece_of_which_nothing_is_seen_stays() -> None:
+    """A void within the ball."""
+    n = len(BALL.vertices)
+    both = Surface(np.concatenate([BALL.vertices, 0.2 * BALL.vertices + 3]), np.concatenate([BALL.faces, BALL.faces[:, ::-1] + n]))
+    closed = closed_over(both, IN_VIEWS, SCENE.capture, DISTANCE)
+    np.testing.assert_array_equal(closed.vertices[n:], both.vertices[n:])
+    np.testing.assert_array_equal(closed.vertices[:n], closed_over(BALL, IN_VIEWS, SCENE.capture, DISTANCE).vertices)

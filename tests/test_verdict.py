@@ -103,6 +103,9 @@ def test_photographs_of_a_place_are_those_of_the_views_that_see_it(scene: Sphere
     # The first view has one photograph, the second two.
     assert photographs(two, surface, [np.arange(10), np.arange(4)]) == 1 and photographs(two, surface, [np.arange(4), np.arange(10)]) == 2
     assert photographs(two, surface, [np.arange(10), np.arange(6)]) == 3 and photographs(two, surface, [np.arange(0), np.arange(0)]) == 0
+    # What was left out shows nothing.
+    less = two.without({two.views[1].name: two.views[1].lights[:1]})
+    assert photographs(less, surface, [np.arange(10), np.arange(6)]) == 2
 
 
 def test_noise_is_no_misfit(scene: SphereScene) -> None:

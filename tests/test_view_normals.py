@@ -115,3 +115,15 @@ def test_views_may_differ_in_size(ball: SphereScene) -> None:
     true = shown(capture, surface, vertex_normals(surface))
     given = noisy(true, 0.1)
     assert error(drawn_to_surface(capture, surface, given), true) < 0.5 * error(given, true)
+
+
+def test_a_view_is_not_its_own_witness_where_another_stands_beside_it(ball: SphereScene) -> None:
+    """Half of the views twice, as with a second set of lights."""
+    surface = ball.reconstruction.surface
+    again = tuple(replace(view, name=f"again_{view.name}") for view in ball.capture.views[: VIEWS // 2])
+    capture = Capture("twice", ball.capture.views + again)
+    true = shown(capture, surface, vertex_normals(surface))
+    given = noisy(true, 0.1)
+    found = drawn_to_surface(capture, surface, given)
+    alone = drawn_to_surface(ball.capture, surface, given[:VIEWS])
+    assert error(found, true) < error(alone, true[:VIEWS])

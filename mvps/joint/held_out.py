@@ -51,7 +51,9 @@ def _lambertian(views: list[ViewSamples], vertices: Vertices, rotations: list[to
     sums = []
     for samples, rotation in zip(views, rotations, strict=True):
         n = vertices.normal[samples.vertex] @ rotation.T * vertices.reflectance[samples.vertex, :1]
-        weight = samples.weight[:, None] * samples.data * (samples.image > 0.2 * samples.image.quantile(0.9, dim=0))
+        # A view may see no vertex, and quantiles of nothing are errors.
+        bright = samples.image.quantile(0.9, dim=0) if len(samples.image) else 0.0
+        weight = samples.weight[:, None] * samples.data * (samples.image > 0.2 * bright)
         sums.append((torch.einsum("pl,pi,pj->lij", weight, n, n), torch.einsum("pl,pl,pi->li", weight, samples.image, n)))
     if one_rig:
         sums = [(torch.stack([H for H, _ in sums]).sum(0), torch.stack([g for _, g in sums]).sum(0))] * len(sums)

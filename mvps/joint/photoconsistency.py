@@ -62,7 +62,8 @@ def shown_in(of: Observed, lights: Lights) -> list[Shown]:
     """Of every view a few photographs, as shown of the vertices as they are; lights: of all photographs of `of`."""
 
     def in_view(view: View, samples: ViewSamples, grey: DirectionalLights, intensity: Float) -> Shown:
-        some = np.unique(np.arange(MOST) * len(view.lights) // MOST)
+        shown = np.flatnonzero(view.shown) if view.shown.any() else np.arange(len(view.lights))
+        some = shown[np.unique(np.arange(MOST) * len(shown) // MOST)]
         rows = torch.as_tensor(some, device=samples.vertex.device)
         few, grey = samples.of_lights(rows), grey.of(rows)
         reflectance = of.vertices.reflectance[few.vertex]

@@ -4,7 +4,8 @@ With the seen vertices fixed, the others minimise
 
     sum over them and their neighbours of |y_i - mean of y_i's neighbours|^2  +  sum over u of tau |y_u - t_u|^2
 
-a discrete thin plate (Botsch and Kobbelt 2004) that leaves the rim with the slope that it has there. Nothing of an object projects outside
+a discrete thin plate (Botsch and Kobbelt 2004) that leaves the rim with the slope that it has there; pieces that no view
+sees stay. Nothing of an object projects outside
 a mask, nor lies in front of what a view sees: a vertex u that does is drawn to t_u, where it comes back into the mask that it is farthest
 out of, or a pixel behind the seen surface; a few passes find them all. The faces stay, so that a closed surface stays closed.
 """
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from mvps.camera import footprint, project, view_directions
 from mvps.cores import on_cores
 from mvps.joint.vertices import MASK_SIGMA_PIXELS
-from mvps.mesh import edges
+from mvps.mesh import edges, labelled_pieces
 from mvps.scene import Bool, Capture, Float, Int, Surface, View
 from mvps.silhouette import sampled
 from mvps.visibility import RayCaster
@@ -40,11 +41,15 @@ def closed_over(surface: Surface, seen: list[Int], capture: Capture, distance: l
     it sees; distance: per view the signed distance to its mask (height, width), pixels."""
     known = np.zeros(len(surface.vertices), bool)
     known[np.concatenate(seen)] = True
-    free, fixed = np.flatnonzero(~known), np.flatnonzero(known)
+    # A piece of which nothing is seen has no rim to be bent from.
+    label, _ = labelled_pieces(surface)
+    held = known.copy()
+    held[surface.faces[~np.isin(label, label[known[surface.faces].any(1)])]] = True
+    free, fixed = np.flatnonzero(~held), np.flatnonzero(held)
     if not len(free) or not len(fixed):
         return surface
     mean = _mean_of_neighbours(surface)
-    rows = (sp.identity(len(known), format="csr") - mean)[np.flatnonzero(~known | (mean @ ~known > 0))]
+    rows = (sp.identity(len(held), format="csr") - mean)[np.flatnonzero(~held | (mean @ ~held > 0))]
     part = rows[:, free]
     bending, right = (part.T @ part).tocsc(), -(part.T @ (rows[:, fixed] @ surface.vertices[fixed]))
     y = CholeskyLike(bending).solve(right)

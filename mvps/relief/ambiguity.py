@@ -102,7 +102,9 @@ class _Relative:
 
     def __init__(self, view: View) -> None:
         image = view.samples.astype(np.float32).mean(-1).astype(np.float64) * view.scale
-        self.bright: Float = np.maximum(np.quantile(image[:, view.shown], BRIGHT_QUANTILE, axis=1), view.scale)
+        self.bright: Float = np.maximum(
+            np.quantile(image[:, view.shown] if view.shown.any() else image, BRIGHT_QUANTILE, axis=1), view.scale
+        )
         self.known = view.usable() & (image > SHADOWED * self.bright[:, None])
         self.image: Float = image / self.bright[:, None]
         self.noise = view.scale / float(np.median(self.bright))

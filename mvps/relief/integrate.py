@@ -29,8 +29,9 @@ STIFFNESS = 2.0
 MOST_SWEEPS, SETTLED = 60, 1e-4
 """Of reweighting; relative change of the energy below which it ends (the paper's are 150 and 1e-4)."""
 
-GAUGE = 1e-8
-"""Weight of log depth itself: parts of the mask that nothing connects would otherwise have no depth."""
+GAUGE, SOFT = 1e-8, 1e-3
+"""Weight of log depth itself: parts of the mask that nothing connects would otherwise have no depth. No more than SOFT of what differences
+weigh in a wave as long as the mask, which would otherwise be flattened where that is many pixels across."""
 
 GRAZING = 0.02
 """Least -n.r over |r|: 89 degrees from the ray. Normals beyond are noise, and their depth would be infinite."""
@@ -82,10 +83,12 @@ def integrate(camera: Camera, mask: Bool, normal: Float, confidence: Float) -> D
     alone = beside[row, side ^ 1] < 0
     trust = np.maximum(confidence, 1e-3)[row]
     share = np.full(len(row), 0.5)
+    longest = float(trust.mean()) * (2 * np.pi / (np.ptp(pixels, axis=0).max() + 1)) ** 2
+    gauge = min(GAUGE, SOFT * longest) * float(np.mean(facing**2))
     t, factor, before = np.zeros((count, 1)), None, np.inf
     for _ in range(MOST_SWEEPS):
         weight = trust * share
-        matrix = difference.T @ sp.diags(weight) @ difference + GAUGE * float(np.mean(facing**2)) * sp.identity(count)
+        matrix = difference.T @ sp.diags(weight) @ difference + gauge * sp.identity(count)
         target = difference.T @ (weight * right)[:, None]
         factor = factor or CholeskyLike(matrix)
         t = factor.nearby(matrix, target, t)
