@@ -47,8 +47,8 @@ from mvps.between_views import BODY, CLEARLY_NEARER, nearer, nearest, said
 from mvps.cores import on_cores
 from mvps.correlation import alike_in_all_views, glossy_lights, is_glossy, lamps_of_a_glossy_surface
 from mvps.mesh import lengths, normalise, vertex_normals
-from mvps.pixel_samples import BRIGHT_QUANTILE, PIXELS_PER_VIEW, SHADOWED, PixelSamples, in_frame, pixel_samples, pooled
-from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface, View
+from mvps.pixel_samples import BRIGHT_QUANTILE, PIXELS_PER_VIEW, SHADOWED, PixelSamples, colour_ratios, in_frame, pixel_samples, pooled
+from mvps.scene import Bool, Capture, CaptureError, Float, Lights, Surface
 from mvps.sharing import shared_frame, vertex_samples
 from mvps.visibility import RayCaster, ray_caster
 from solvers.low_rank import Factorisation, factorise, of_length_one, robust_weights, solve_rows
@@ -241,18 +241,6 @@ def _from_normals(sample: PixelSamples) -> Float:
         weights = robust_weights(residual.T, lit.T, sample.noise * float(np.median(sample.bright)))
         lights = solve_rows(absolute.T, weights, sample.normal)
     return without_gaps(lights)
-
-
-def colour_ratios(view: View) -> Float:
-    """(lights, 3) intensity of each light's channels over their mean, from the colour of the whole view: the object's mean
-    albedo is taken as the mean over all lights, so only differences between lights count."""
-    total = np.maximum(view.samples.sum(0, dtype=np.float64), 1.0)
-    chroma = total / total.mean(1, keepdims=True)
-    usual = np.median(chroma[view.shown], axis=0) if view.shown.any() else np.ones(3)
-    # A photograph that was left out says nothing: white.
-    ratio = np.where(view.shown[:, None], chroma / usual, 1.0)
-    of_mean_one: Float = ratio / ratio.mean(1, keepdims=True)
-    return of_mean_one
 
 
 def normalised(directions: list[Float], intensities: list[Float], one_rig: bool, fixed: bool = False) -> Lights:

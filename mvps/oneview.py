@@ -117,17 +117,19 @@ def lights_again(view: View, lights: Lights, rough: Float, seed: int) -> tuple[L
     from mvps.relief.ambiguity import Resolved, factors_under, resolved
 
     strength = lights.intensity[0].mean(1, keepdims=True)
-    pseudo = factors_under(view, lights.direction[0] @ view.camera.rotation.T * strength)
+    colour = lights.intensity[0] / strength
+    pseudo = factors_under(view, lights.direction[0] @ view.camera.rotation.T * strength, colour)
     found = Resolved(pseudo, rough, resolved(view, pseudo, rough, np.eye(3), np.random.default_rng(seed)))
-    return _lights(view, found.lights, lights.intensity[0] / strength), found
+    return _lights(view, found.lights, colour), found
 
 
 def _lights(view: View, scaled: Float, colour: Float | None = None) -> Lights:
     """Lights of intensity times direction (lights, 3), camera frame; colour (lights, 3) of their intensities, mean one, that of the view as
     a whole if None."""
-    from mvps.calibrate import colour_ratios, normalised, without_gaps
+    from mvps.calibrate import normalised, without_gaps
+    from mvps.pixel_samples import lamp_colours
 
-    scaled, colour = without_gaps(scaled), colour_ratios(view) if colour is None else colour
+    scaled, colour = without_gaps(scaled), lamp_colours(view) if colour is None else colour
     strength = np.linalg.norm(scaled, axis=1, keepdims=True)
     return normalised([scaled / strength @ view.camera.rotation], [strength * colour], True)
 
@@ -135,9 +137,12 @@ def _lights(view: View, scaled: Float, colour: Float | None = None) -> Lights:
 def residuals(view: View, maps: NormalMap, lights: Lights) -> Float:
     """(lights,) of each photograph the median residual of Lambert's law over its median value, at its well lit pixels; NaN where these are
     too few."""
+    from mvps.pixel_samples import grey_under
+
     cosine = maps.normal.astype(np.float64) @ lights.direction[0].T
-    predicted = maps.albedo.mean(1)[:, None] * cosine * lights.intensity[0].mean(1)
-    image = view.samples.mean(-1) * view.scale
+    strength = lights.intensity[0].mean(1)
+    predicted = maps.albedo.mean(1)[:, None] * cosine * strength
+    image = grey_under(view.samples, lights.intensity[0] / strength[:, None]) * view.scale
     lit = view.usable() & (cosine > LIT) & (maps.confidence > 0)[:, None]
     enough = [np.flatnonzero(lit[:, k]) if lit[:, k].sum() >= FEWEST_PIXELS else None for k in range(lit.shape[1])]
     found = [

@@ -7,6 +7,7 @@ which a fifth of its samples exceed. Over that level pixels are looked at, so th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,3 +101,41 @@ def in_frame(samples: list[PixelSamples], capture: Capture, frame: Frame) -> lis
     if frame == "camera":
         return samples
     return [replace(s, normal=s.normal @ view.camera.rotation) for s, view in zip(samples, capture.views, strict=True)]
+
+
+def colour_ratios(view: View) -> Float:
+    """(lights, 3) intensity of each light's channels over their mean, from the colour of the whole view: the object's mean
+    albedo is taken as the mean over all lights, so only differences between lights count."""
+    total = np.maximum(view.samples.sum(0, dtype=np.float64), 1.0)
+    chroma = total / total.mean(1, keepdims=True)
+    usual = np.median(chroma[view.shown], axis=0) if view.shown.any() else np.ones(3)
+    # A photograph that was left out says nothing: white.
+    ratio = np.where(view.shown[:, None], chroma / usual, 1.0)
+    of_mean_one: Float = ratio / ratio.mean(1, keepdims=True)
+    return of_mean_one
+
+
+def lamp_colours(view: View) -> Float:
+    """(lights, 3) intensity of each light's channels over their mean, 1 for what is usual: the median over pixels of their colour under the
+    light over their colour under most lights. Which part of the object a light shows does not matter, as it does to the view's sum."""
+    some = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS_PER_VIEW])
+    samples = view.samples[some].astype(np.float64)
+    grey = samples.mean(-1)
+    shown = grey[:, view.shown] if view.shown.any() else grey
+    known = view.usable()[some] & (grey > SHADOWED * np.maximum(np.quantile(shown, BRIGHT_QUANTILE, axis=1, keepdims=True), 1))
+    chroma = np.where(known[..., None], samples / np.maximum(grey, 1)[..., None], np.nan)
+    with catch_warnings():
+        # Of pixels and lights without samples.
+        simplefilter("ignore", RuntimeWarning)
+        usual = np.nanmedian(chroma, axis=1, keepdims=True)
+        ratio = np.nanmedian(chroma / np.where(usual > 0, usual, np.nan), axis=0)
+    ratio = np.where(np.isfinite(ratio).all(1, keepdims=True), ratio, 1.0)
+    of_mean_one: Float = ratio / ratio.mean(1, keepdims=True)
+    return of_mean_one
+
+
+def grey_under(samples: NDArray[np.uint16], colour: Float) -> NDArray[np.float32]:
+    """(n, lights) code values (n, lights, 3) under lights of colour (lights, 3), mean one, as white ones as strong would make them: what
+    the channels' plain mean makes of a coloured lamp depends on the object's colour."""
+    grey: NDArray[np.float32] = (samples * (1 / colour).astype(np.float32)).mean(-1)
+    return grey

@@ -35,6 +35,7 @@ from mvps.correlation import sphere
 from mvps.exemplars import Weights, enough, left_by_materials, patches
 from mvps.material import SHARPNESS
 from mvps.mesh import normalise
+from mvps.pixel_samples import grey_under, lamp_colours
 from mvps.scene import Float, Int, View
 from solvers.adam import Adam
 
@@ -94,7 +95,7 @@ def lights_by_materials(view: View, lights: Float, rough: Float, outline: Int, d
 
 def _lights(view: View, lights: Float, rough: Float, outline: Int, device: torch.device, draw: np.random.Generator) -> Float:
     """(lights, 3) by one draw of pixels."""
-    asked, strength = _asked(view, rough, outline, device, draw), np.linalg.norm(lights, axis=1)
+    asked, strength = _asked(view, lamp_colours(view), rough, outline, device, draw), np.linalg.norm(lights, axis=1)
     usual = np.exp(np.log(strength).mean())
     relative = np.log(strength / usual)
     start, level = (torch.from_numpy(a.astype(np.float32)).to(device) for a in (lights / strength[:, None], relative))
@@ -116,7 +117,8 @@ def materials_under(view: View, direction: Float, intensity: Float, device: torc
     if not enough(view).any():
         return np.ones((2, 1 + len(SHARPNESS)), np.float32)
     nowhere = np.zeros((len(view.pixels), 3))
-    asked = _asked(view, nowhere, np.zeros(0, int), device, np.random.default_rng(0))
+    colour = intensity / intensity.mean(1, keepdims=True)
+    asked = _asked(view, colour, nowhere, np.zeros(0, int), device, np.random.default_rng(0))
     light = direction @ view.camera.rotation.T
     relative = np.log(intensity.mean(1)) - np.log(intensity.mean(1)).mean()
     known, level = (torch.from_numpy(a.astype(np.float32)).to(device) for a in (light, relative))
@@ -124,8 +126,8 @@ def materials_under(view: View, direction: Float, intensity: Float, device: torc
     return found
 
 
-def _asked(view: View, rough: Float, outline: Int, device: torch.device, draw: np.random.Generator) -> _Asked:
-    """Pixels to be asked, those near the outline (n,) last."""
+def _asked(view: View, colour: Float, rough: Float, outline: Int, device: torch.device, draw: np.random.Generator) -> _Asked:
+    """Pixels to be asked under lights of colour (lights, 3), mean one, those near the outline (n,) last."""
     usable, known = view.usable(), enough(view)
     anywhere = draw.permutation(np.flatnonzero(known))[:PIXELS]
     rows = np.concatenate([anywhere, draw.permutation(outline[known[outline]])[:AT_OUTLINE]])
@@ -134,7 +136,7 @@ def _asked(view: View, rough: Float, outline: Int, device: torch.device, draw: n
     grid = grid[grid @ towards[0] > 0]
     off = ((rough[rows, None] - grid) ** 2).sum(-1) / OUTLINE**2
     off[: len(anywhere)] = 0
-    image = np.where(usable[rows], view.samples[rows].mean(-1), 0)
+    image = np.where(usable[rows], grey_under(view.samples[rows], colour), 0)
     arrays = (image, usable[rows], 2 * np.log1p(off), grid, towards)
     return _Asked(*(torch.from_numpy(a.astype(np.float32)).to(device) for a in arrays))
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from test_relief import ball, photographed
 
 from mvps.evaluate import evaluate_result
 from mvps.evaluate import main as evaluate
@@ -18,8 +19,9 @@ from mvps.joint.one_view import Start, refine_view, with_rim, without_lobes
 from mvps.joint.refine import RefineSettings
 from mvps.load import read_capture, read_truth
 from mvps.mesh import angles_deg
-from mvps.oneview import distance_of, first_lights, lights_again, surface_of, without_misfits
-from mvps.photometric import normal_maps
+from mvps.oneview import distance_of, first_lights, lights_again, residuals, surface_of, without_misfits
+from mvps.photometric import normal_map, normal_maps
+from mvps.pixel_samples import lamp_colours
 from mvps.progress import Progress
 from mvps.reconstruct import Settings, reconstruct
 from mvps.reconstruct import main as reconstruct_main
@@ -236,6 +238,29 @@ def test_an_object_of_a_few_pixels_has_a_result_that_is_doubted(made: tuple[Capt
     near = np.abs(np.indices(view.mask.shape) - middle[:, None, None]).max(0) < 5
     found = reconstruct(sound(one_view(near, made), Progress())[0], Settings("made", preset="draft"), None, Progress())
     assert np.isfinite(found.surface.vertices).all() and found.metrics["status"]["name"] != "one view"
+
+
+@pytest.mark.parametrize("colour", [(1.0, 1.0, 1.0), (1.6, 0.7, 0.7)])
+def test_lamps_may_differ_in_colour_on_an_object_that_has_one(colour: tuple[float, float, float]) -> None:
+    """Three of sixteen; the plain mean of the channels of a red ball makes the reddish ones a quarter stronger, lights 3 degrees off, and
+    would tell such photographs from the others under true lights."""
+    mask, _, normal = ball()
+    view, scaled = photographed(mask, normal, np.where(np.argwhere(mask)[:, 1] < 32, 0.8, 0.4), 16, 0)
+    tint = np.ones((16, 3))
+    tint[[2, 7, 11]] = colour
+    values = view.samples * np.array([0.9, 0.25, 0.15]) * tint / 1.6
+    tinted = replace(view, samples=np.rint(values).astype(np.uint16))
+    found = lamp_colours(tinted)
+    np.testing.assert_allclose(found, tint / tint.mean(1, keepdims=True), atol=0.01)
+    strength = np.linalg.norm(scaled, axis=1, keepdims=True)
+    lights = Lights((scaled / strength,), (strength * tint / 1.6 * 60000 / 65535,), True)
+    capture = Capture("ball", (tinted,))
+    maps = normal_map(tinted, lights.direction[0], lights.intensity[0], torch.device("cpu"))
+    assert np.nanmax(residuals(tinted, maps, lights)) < 0.02
+    rough = inflated_normals(mask)
+    solved = first_lights(capture, rough, lights_under(tinted, rough), 0)[0]
+    ratio = solved.intensity[0].mean(1) / strength[:, 0]
+    assert ratio[[2, 7, 11]].mean() / np.delete(ratio, [2, 7, 11]).mean() == pytest.approx(1, abs=0.05)
 
 
 def test_too_few_photographs_are_refused(captures: Path) -> None:

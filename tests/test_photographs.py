@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from sphere_scene import camera_at
 
-from mvps.calibrate import colour_ratios
 from mvps.checks.photographs import FOREIGN, photographs
 from mvps.joint.colours import _ratios
+from mvps.pixel_samples import colour_ratios
 from mvps.scene import Capture, View
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings

@@ -18,10 +18,10 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 
 from mvps.atlas import Atlas, Texels, build_atlas, padded, rasterise
-from mvps.calibrate import colour_ratios
 from mvps.camera import bilinear, footprint, inside_image, project, view_directions
 from mvps.cores import on_cores
 from mvps.mesh import lengths, normalise, vertex_normals
+from mvps.pixel_samples import colour_ratios
 from mvps.scene import Capture, Float, Int, Surface, View
 from mvps.silhouette import sampled
 from mvps.texture import away_from_border

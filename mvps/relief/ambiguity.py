@@ -33,7 +33,7 @@ from scipy.optimize import least_squares
 
 from mvps.camera import pixel_centres
 from mvps.mesh import angles_deg, lengths, normalise
-from mvps.pixel_samples import BRIGHT_QUANTILE, SHADOWED
+from mvps.pixel_samples import BRIGHT_QUANTILE, SHADOWED, grey_under, lamp_colours
 from mvps.scene import Bool, Float, Int, View
 from solvers.low_rank import CAUCHY_95, MAD_TO_SIGMA, factorise, of_length_one, robust_weights, solve_rows
 
@@ -97,11 +97,13 @@ class Resolved:
 
 
 class _Relative:
-    """A view's grey photographs over what a pixel is at its brightest: image (pixels, lights) over bright (pixels,), known where neither
-    clipped nor in shadow, and its noise."""
+    """A view's grey photographs, as white lamps would make them, over what a pixel is at its brightest: image (pixels, lights) over bright
+    (pixels,), known where neither clipped nor in shadow, and its noise."""
 
-    def __init__(self, view: View) -> None:
-        image = view.samples.astype(np.float32).mean(-1).astype(np.float64) * view.scale
+    def __init__(self, view: View, colour: Float | None = None) -> None:
+        """colour (lights, 3) of the lights, mean one; as the view as a whole tells it if None."""
+        colour = lamp_colours(view) if colour is None else colour
+        image = grey_under(view.samples, colour).astype(np.float64) * view.scale
         self.bright: Float = np.maximum(
             np.quantile(image[:, view.shown] if view.shown.any() else image, BRIGHT_QUANTILE, axis=1), view.scale
         )
@@ -141,9 +143,10 @@ def away_deg(lights: Float, under: Float) -> float:
     return float(angles_deg(normalise(lights[told]), normalise(under[told])).mean()) if told.any() else 0.0
 
 
-def factors_under(view: View, lights: Float) -> Pseudo:
-    """Factors of a view's grey photographs under lights (lights, 3), intensity times direction, that are known up to A."""
-    return _Relative(view).factored(lights)
+def factors_under(view: View, lights: Float, colour: Float | None = None) -> Pseudo:
+    """Factors of a view's grey photographs under lights (lights, 3), intensity times direction, that are known up to A; colour (lights, 3),
+    mean one, that of the view as a whole if None."""
+    return _Relative(view, colour).factored(lights)
 
 
 def outer_band(view: View) -> Int:
