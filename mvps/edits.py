@@ -9,7 +9,8 @@
     specular  {"factor": 2} of the weights,  {"sharpness_factor": 4} of the lobes' sharpness, highlights keeping their energy
     preset    "matte", "satin", "glossy", "polished", "gold": a whole material (PRESETS)
 
-The energy of a lobe is 8 w / s (pbr.py), so a preset of reflectance F0 at normal incidence has w = g F0 s / 8, g the material's white.
+The energy of a lobe is 8 w / s (pbr.py), so a preset of reflectance F0 at normal incidence has w = g F0 s / 8. Its g, and what colours are
+times, is the white of the material before any edit: the same edit again changes nothing, and their order does not make colours darker.
 """
 
 from __future__ import annotations
@@ -83,13 +84,13 @@ def read_edits(path: Path) -> list[dict[str, Any]]:
 
 def edited(surface: Surface, material: Material, edits: Sequence[Mapping[str, Any]], cameras: Mapping[str, Camera]) -> Material:
     """The material after the edits. cameras: by the names that regions give as views. CaptureError about what an edit gets wrong."""
-    # What an edit has made of a kind of material must not decide what the next one takes for that kind.
-    reconstructed = material
+    # What an edit has made of a kind of material, or of the brightest, must not decide what the next one takes for that kind, or for white.
+    reconstructed, white = material, reflectance_scale(material)
     for number, edit in enumerate(edits, 1):
         where = f"{edit['file']}: edit {number}" if "file" in edit else f"edit {number}"
         try:
             chosen = region_of(surface, reconstructed, _part(edit, "region"), cameras)
-            material = _changed(surface, material, chosen, edit, cameras)
+            material = _changed(surface, material, white, chosen, edit, cameras)
         except CaptureError as error:
             # About a picture, with what to try.
             raise CaptureError(f"{where}: {error}") from error
@@ -98,14 +99,18 @@ def edited(surface: Surface, material: Material, edits: Sequence[Mapping[str, An
     return material
 
 
-def _changed(surface: Surface, material: Material, chosen: Bool, edit: Mapping[str, Any], cameras: Mapping[str, Camera]) -> Material:
-    """The material after one edit of the chosen vertices."""
+def _changed(
+    surface: Surface, material: Material, white: float, chosen: Bool, edit: Mapping[str, Any], cameras: Mapping[str, Camera]
+) -> Material:
+    """The material after one edit of the chosen vertices. white: the reflectance that colours and presets are over."""
     albedo, specular = _part(edit, "albedo"), _part(edit, "specular")
     if "preset" in edit:
-        material = with_preset(material, chosen, edit["preset"])
+        material = with_preset(material, white, chosen, edit["preset"])
     if albedo is not None:
-        painted = "painted" in albedo
-        material = with_painted(surface, material, chosen, cameras, **albedo) if painted else with_albedo(material, chosen, **albedo)
+        if "painted" in albedo:
+            material = with_painted(surface, material, white, chosen, cameras, **albedo)
+        else:
+            material = with_albedo(material, white, chosen, **albedo)
     return material if specular is None else with_specular(material, chosen, **specular)
 
 
@@ -191,12 +196,17 @@ def clusters(surface: Surface, material: Material, count: int) -> Int:
 
 
 def with_albedo(
-    material: Material, chosen: Bool, colour: Sequence[float] | None = None, factor: float | Sequence[float] = 1.0, hue_deg: float = 0.0
+    material: Material,
+    white: float,
+    chosen: Bool,
+    colour: Sequence[float] | None = None,
+    factor: float | Sequence[float] = 1.0,
+    hue_deg: float = 0.0,
 ) -> Material:
-    """The material with another albedo on the chosen vertices."""
+    """The material with another albedo on the chosen vertices; a colour of 1 is as bright as `white`."""
     albedo = material.albedo.copy()
     if colour is not None:
-        albedo[chosen] = _colour(colour, "colour") * reflectance_scale(material)
+        albedo[chosen] = _colour(colour, "colour") * white
     albedo[chosen] *= _colour(factor, "factor")
     turn = _number(hue_deg, "hue_deg", -LARGEST)
     if turn:
@@ -204,9 +214,11 @@ def with_albedo(
     return replace(material, albedo=albedo, residual=None)
 
 
-def with_painted(surface: Surface, material: Material, chosen: Bool, cameras: Mapping[str, Camera], painted: str, view: str) -> Material:
-    """The material with the colours of a picture, sRGB, of the view's size, on the chosen vertices that the view's camera sees; what the
-    picture has clear stays."""
+def with_painted(
+    surface: Surface, material: Material, white: float, chosen: Bool, cameras: Mapping[str, Camera], painted: str, view: str
+) -> Material:
+    """The material with the colours of a picture, sRGB, its white as bright as `white`, of the view's size, on the chosen vertices that the
+    view's camera sees; what the picture has clear stays."""
     camera = _camera(cameras, view)
     picture = read_painting(_picture(painted, "painted"), camera.height, camera.width)
     seen = np.flatnonzero(visible_vertices(ray_caster(surface), camera) & chosen)
@@ -215,7 +227,7 @@ def with_painted(surface: Surface, material: Material, chosen: Bool, cameras: Ma
     # A clear pixel has no colour of its own to mix into its neighbours'.
     mixed = sampled(np.concatenate([linear_of_srgb(picture[..., :3]) * opacity, opacity], 2).astype(np.float32), at)
     albedo = material.albedo.copy()
-    albedo[seen] += mixed[:, :3] * reflectance_scale(material) - mixed[:, 3:] * albedo[seen]
+    albedo[seen] += mixed[:, :3] * white - mixed[:, 3:] * albedo[seen]
     return replace(material, albedo=albedo, residual=None)
 
 
@@ -239,12 +251,11 @@ def with_specular(material: Material, chosen: Bool, factor: float = 1.0, sharpne
     return replace(material, specular_weight=np.concatenate([weight, moved], axis=1), sharpness=sharpness, residual=None)
 
 
-def with_preset(material: Material, chosen: Bool, name: str) -> Material:
-    """The material with a preset's highlights on the chosen vertices."""
+def with_preset(material: Material, white: float, chosen: Bool, name: str) -> Material:
+    """The material with a preset's highlights on the chosen vertices, reflectances over `white`."""
     if not isinstance(name, str) or name not in PRESETS:
         raise ValueError(f"wanted one of {', '.join(PRESETS)} as preset, given {_said(name)}")
     sharpness, at_normal, metal = PRESETS[name]
-    white = reflectance_scale(material)
     weight = material.specular_weight
     weight = weight.copy() if weight.ndim == 3 else weight[..., None].repeat(3, axis=2)
     weight[chosen] = 0

@@ -54,6 +54,23 @@ def test_a_preset_reflects_what_it_says() -> None:
     assert not gold.albedo.any() and not after({"preset": "matte"}).specular_weight.any()
 
 
+def test_white_is_that_before_any_edit(tmp_path: Path) -> None:
+    """The same edit again changes nothing, and gloss is as strong on what was made dark or black."""
+    white = reflectance_scale(MATERIAL)
+    grey, dark, gone = ({"albedo": edit} for edit in ({"colour": [0.5] * 3}, {"colour": [0.02] * 3}, {"factor": 0}))
+    matte, glossy = {"preset": "matte"}, {"preset": "glossy"}
+    np.testing.assert_allclose(after(matte, *3 * [grey]).albedo, 0.5 * white)
+    for edits in ([glossy, dark], [matte, dark, glossy], [matte, gone, glossy], [matte | gone, glossy]):
+        made = after(*edits)
+        np.testing.assert_allclose(specular_energy(made.specular_weight, made.sharpness), 0.04 * white, err_msg=str(edits))
+    view = SCENE.capture.views[0]
+    cv2.imwrite(str(tmp_path / "over.png"), np.full((*view.mask.shape, 3), 255, np.uint8))
+    painted = {"albedo": {"painted": str(tmp_path / "over.png"), "view": "view_01"}}
+    made = after(matte, gone, painted)
+    np.testing.assert_allclose(made.albedo[made.albedo.any(1)], white)
+    np.testing.assert_array_equal(after(matte, gone, painted, painted).albedo, made.albedo)
+
+
 def test_a_painted_region_is_what_its_camera_sees(tmp_path: Path) -> None:
     view = SCENE.capture.views[0]
     mask = np.zeros(view.mask.shape, np.uint8)
