@@ -60,7 +60,8 @@ class Range(NamedTuple):
 
 
 def write_pictures(given: Namespace) -> None:
-    """Renders what the options of mvps.render ask for into a new folder. CaptureError about everything that is wrong with them."""
+    """Renders what the options of mvps.render ask for into a new folder. CaptureError about everything that is wrong with them, and where
+    the encoder of videos fails: then the folder has the pictures all the same, and the videos that came out."""
     result = read_reconstruction(given.result)
     cameras = chosen_cameras(given, result)
     sizes = {f"{camera.width} x {camera.height}": None for camera in cameras.values()}
@@ -76,6 +77,7 @@ def write_pictures(given: Namespace) -> None:
     encoder = ffmpeg() if given.video else ""
     caster = ray_caster(result.surface)
     senders = None if given.no_bounce else light_senders(result.surface, material)
+    failed = ""
     # What overflows is found by check_finite, which says it better.
     with appearing_whole(given.out) as writing, np.errstate(all="ignore"):
         frames = writing / ".frames" if given.video and given.format != "png" else writing
@@ -95,9 +97,12 @@ def write_pictures(given: Namespace) -> None:
                         write_layer(frames, f"{name}_{layer}", layer, found[layer], coverage, shown, "png")
                 stage.advance(1)
         for layer in given.layers if given.video else ():
-            write_video(encoder, frames, list(cameras), layer, writing)
+            failed = failed or write_video(encoder, frames, list(cameras), layer, writing)
         if frames != writing:
             shutil.rmtree(frames)
+    if failed:
+        wanted = f"wanted a video of {len(cameras)} pictures, given an encoder that fails ({failed[:200]})"
+        raise CaptureError(f"--video: {wanted}; the pictures are in {given.out}: make the video from them, or leave --video out")
 
 
 def depths_of(given: Namespace, caster: RayCaster, material: Material, cameras: dict[str, Camera]) -> tuple[float, float]:
@@ -235,14 +240,22 @@ def ffmpeg() -> str:
     return str(get_ffmpeg_exe())
 
 
-def write_video(encoder: str, folder: Path, names: list[str], layer: str, out: Path) -> None:
-    """LAYER.mp4 in the folder `out`, of the 8-bit pictures NAME_LAYER.png in their order, on white."""
-    listed = folder / f".{layer}.txt"
+def write_video(encoder: str, folder: Path, names: list[str], layer: str, out: Path) -> str:
+    """LAYER.mp4 in the folder `out`, of the 8-bit pictures NAME_LAYER.png in their order, on white. What the encoder says where it fails,
+    and then no file; else empty."""
+    listed, video = folder / f".{layer}.txt", out.resolve() / f"{layer}.mp4"
     listed.write_text("".join(f"file '{name}_{layer}.png'\nduration {1 / FRAMES_PER_SECOND}\n" for name in names), encoding="utf-8")
     even = "format=rgba,pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white@0"
     onto_white = f"{even},split[a][b];[b]drawbox=c=white:t=fill:replace=1[w];[w][a]overlay,format=yuv420p"
-    command = [encoder, "-v", "error", "-f", "concat", "-i", listed.name, "-filter_complex", onto_white, "-r", str(FRAMES_PER_SECOND)]
-    done = subprocess.run([*command, str(out.resolve() / f"{layer}.mp4")], cwd=folder, capture_output=True, text=True, check=False)
+    # Unless told that names are safe the encoder refuses spaces, + and letters beyond ASCII, which cameras' names may have.
+    reading = ["-f", "concat", "-safe", "0", "-i", listed.name]
+    command = [encoder, "-v", "error", *reading, "-filter_complex", onto_white, "-r", str(FRAMES_PER_SECOND), str(video)]
+    try:
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, errors="replace", check=False)
+        failed = (done.stderr.strip() or f"exit status {done.returncode}") if done.returncode else ""
+    except OSError as error:
+        failed = error.strerror or "it does not start"
     listed.unlink()
-    if done.returncode:
-        raise CaptureError(f"--video: wanted a video of {len(names)} pictures, given an encoder that fails ({done.stderr.strip()[:200]})")
+    if failed:
+        video.unlink(missing_ok=True)
+    return failed

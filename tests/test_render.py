@@ -21,7 +21,7 @@ from mvps.render import main, render_view
 from mvps.rendering import RAYS_ACROSS
 from mvps.scene import Camera, CaptureError, Lights, Truth, View
 from mvps.synthetic.files import write_capture
-from mvps.viewpoints import look_at
+from mvps.viewpoints import cameras_record, look_at
 from mvps.visibility import RayCaster
 
 SPAN = 2.0
@@ -165,6 +165,48 @@ def test_videos_look_alike_whatever_the_format(folders: tuple[Path, Path], tmp_p
     assert names == ["image.mp4", "normals.mp4", *(f"turn_000{k}_{layer}.{suffix}" for k in (1, 2) for layer in ("image", "normals"))]
     for layer in ("image", "normals"):
         assert (tmp_path / form / f"{layer}.mp4").read_bytes() == (tmp_path / "png" / f"{layer}.mp4").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["top view", "a+b", "Ansicht_ü", "x.1", "-a"])
+def test_a_video_of_cameras_of_any_name(folders: tuple[Path, Path], tmp_path: Path, name: str) -> None:
+    camera = look_at(np.array([400.0, 0, 0]), np.zeros(3), np.array([0.0, 0, 1]), 40, 30)
+    cameras_file = tmp_path / "cameras.json"
+    cameras_file.write_text(json.dumps(cameras_record({name: camera, f"{name}2": camera})))
+    names = rendered_files(folders, tmp_path / "out", "--cameras", str(cameras_file), "--video")
+    assert names == sorted([f"{name}_image.png", f"{name}2_image.png", "image.mp4"])
+    video = cv2.VideoCapture(str(tmp_path / "out" / "image.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 2 and video.read()[1].shape == (30, 40, 3)
+
+
+FAILING = '#!/bin/sh\nfor last; do :; done\necho part > "$last"\necho no room for it >&2\nexit 1\n'
+"""An encoder that leaves a part of the video behind."""
+
+
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [(FAILING, "no room for it"), ("#!/bin/sh\nexit 3\n", "exit status 3"), ("", "Permission denied")],
+    ids=["part", "silent", "no program"],
+)
+@pytest.mark.parametrize("form", ["png", "exr"])
+def test_pictures_stay_where_the_encoder_fails(
+    folders: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    script: str,
+    said: str,
+    form: str,
+) -> None:
+    program = tmp_path / "encoder"
+    program.write_text(script)
+    program.chmod(0o755 if script else 0o644)
+    monkeypatch.setattr("mvps.new_pictures.ffmpeg", lambda: str(program))
+    options = ["--turntable", "2", "--size", "40x30", "--video", "--format", form, "--quiet"]
+    assert run(main, [str(folders[0]), "--out", str(tmp_path / "out"), *options]) == 2
+    told = capsys.readouterr().err
+    assert f"--video: wanted a video of 2 pictures, given an encoder that fails ({said}" in told
+    assert f"the pictures are in {tmp_path / 'out'}" in told
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [f"turn_000{k}_image.{form}" for k in (1, 2)]
 
 
 def test_the_first_picture_that_shows_the_object_gives_the_exposure(folders: tuple[Path, Path], tmp_path: Path) -> None:
