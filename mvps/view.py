@@ -128,7 +128,7 @@ class Model:
             "document.getElementById('beside').src = 'photograph?of=' + name;"
             "if (!window.mvpsViewer) return; window.mvpsViewer.look(cameras[name.split('/')[0]]);"
             "const light = said.split(',').map(Number); window.mvpsViewer.lightFrom(light.slice(0, 3), light.slice(3)); };"
-            "list.addEventListener('input', show); show(); })();</script>"
+            "list.addEventListener('input', show); window.addEventListener('mvpsviewer', show); show(); })();</script>"
         )
 
     def shadow(self, query: str) -> Answer:

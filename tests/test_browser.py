@@ -180,6 +180,22 @@ def test_the_server_s_page_has_exact_shadows_and_photographs(scene: SphereScene,
     assert not said
 
 
+def test_the_first_photograph_is_taken_over_at_once(scene: SphereScene, opened: Opened) -> None:
+    """The picture that coming back to it gives."""
+    with server(Model(scene.reconstruction, scene.capture), 0) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        page, said = opened(f"http://127.0.0.1:{serving.server_port}/")
+        page.evaluate("document.getElementById('viewer-exact').style.visibility = 'hidden'")
+        first = shown(page)
+        assert page.locator("#viewer-fill").input_value() == "0" and page.evaluate("document.getElementById('beside').naturalWidth > 0")
+        for index in (3, 0):
+            page.select_option("#photograph", index=index)
+            again = shown(page)
+        assert np.abs(first - again).mean() < 0.1
+        serving.shutdown()
+    assert not said
+
+
 ROLLED = {"eye": [80.0, 0, 0], "forward": [-1.0, 0, 0], "above": [0.0, 1, 0], "focal": [100.0, 100], "middle": [32.0, 24], "size": [64, 48]}
 """A camera that holds the world's y upwards, where the page holds its z."""
 

@@ -477,6 +477,8 @@
       later();
     },
   };
+  // Who waits for it, as the photographs beside do, may use it from now on.
+  window.dispatchEvent(new Event("mvpsviewer"));
   ask(0).catch(failed);
   later();
 })().catch((error) => { document.getElementById("viewer-said").textContent = "The viewer failed: " + error.message; console.error(error); });
