@@ -200,6 +200,42 @@ ROLLED = {"eye": [80.0, 0, 0], "forward": [-1.0, 0, 0], "above": [0.0, 1, 0], "f
 """A camera that holds the world's y upwards, where the page holds its z."""
 
 
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("away_deg", [0, 2])
+def test_a_view_from_above_or_below_can_be_tilted(scene: SphereScene, opened: Opened, side: int, away_deg: float) -> None:
+    """A photograph along the axis that the object is turned about: the model stays in sight, as in the photograph, and follows both ways."""
+    with server(Model(scene.reconstruction, None), 0) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        page, said = opened(f"http://127.0.0.1:{serving.server_port}/")
+        page.evaluate("document.getElementById('viewer-exact').style.visibility = 'hidden'")
+        page.select_option("#viewer-layer", "normals")
+        angle = np.radians(away_deg)
+        # Upwards in the picture is the world's x.
+        direction, above = side * np.array([-np.sin(angle), 0, np.cos(angle)]), np.array([np.cos(angle), 0, np.sin(angle)])
+        lens = {"focal": [384.0, 384], "middle": [48.0, 48], "size": [96, 96]}
+        through = {"eye": (250 * direction).tolist(), "forward": (-direction).tolist(), "above": above.tolist()} | lens
+        page.evaluate("camera => window.mvpsViewer.look(camera)", through)
+        box = page.locator("#viewer").bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        pictures = []
+        # The first move leaves the photograph's camera, and turns the model a little; the others tilt it, and part of the way back.
+        for across, down in ((9, 0), (0, -75 * side), (0, 45 * side)):
+            page.mouse.move(x, y)
+            page.mouse.down()
+            page.mouse.move(x + across, y + down, steps=abs(across + down) // 3)
+            page.mouse.up()
+            pictures.append(shown(page))
+        # The normal in the middle, towards the eye: red, green and blue are (n + 1) / 2 of x, y and z.
+        middle = [picture[picture.shape[0] // 2, picture.shape[1] // 2, ::-1] / 127.5 - 1 for picture in pictures]
+        near, away, back = (side * float(n[2]) for n in middle)
+        assert near > 0.95 and away < 0.9 and away + 0.03 < back < near
+        # Upwards in the picture is the world's x still: normals lean there.
+        top, bottom = (pictures[0][round(part * pictures[0].shape[0]), pictures[0].shape[1] // 2, 2] for part in (0.4, 0.6))
+        assert top > bottom + 20
+        serving.shutdown()
+    assert not said
+
+
 def test_light_follows_the_hand_in_any_photograph(scene: SphereScene, opened: Opened) -> None:
     """To the right on the screen, however the photograph's camera was rolled."""
     with server(Model(scene.reconstruction, None), 0) as serving:

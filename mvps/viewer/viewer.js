@@ -366,8 +366,10 @@
   // ---- hands ----
   const leave = () => {
     if (!camera) return;
-    const aside = add(camera.eye, centre, -1);
+    const aside = add(camera.eye, centre, -1), above = camera.above;
     [from, distance, camera] = [unit(aside), Math.min(Math.max(Math.hypot(...aside), 1.2 * radius), 20 * radius), null];
+    // Straight from above or below any direction may be up in the picture: the photograph's stays.
+    if (Math.hypot(...cross(up, from)) < 1e-3) from = unit(add(from, above, -1e-3 * Math.sign(dot(up, from))));
   };
   const move = (x, y, ofLight) => {
     if (!ofLight) leave();
@@ -378,8 +380,9 @@
       ask(chosen).catch(failed);
     } else {
       from = turned(from, up, -x);
-      const lifted = turned(from, unit(cross(up, from)), -y);
-      if (Math.abs(dot(lifted, up)) < 0.995) from = unit(lifted);
+      const axis = cross(up, from), lifted = turned(from, unit(axis), -y), steep = (of) => Math.abs(dot(of, up));
+      // Not over the poles, where the picture would turn around, nor near them, but away from there, where photographs may lead.
+      if (dot(cross(up, lifted), axis) > 0 && (steep(lifted) < 0.995 || steep(lifted) < steep(from))) from = unit(lifted);
     }
     later();
   };
