@@ -15,11 +15,12 @@ side (shading.lobes): else a polished body would show the lights one by one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mvps.mesh import normalise
 from mvps.scene import Float
@@ -98,6 +99,13 @@ def environment_lights(picture: NDArray[np.float32], count: int, up: Float, azim
     spread = np.linalg.eigvalsh(square - mean[:, :, None] * mean[:, None])[:, -1]
     intensity = np.array([colour.sum((0, 1)) for _, colour, _ in lights]).reshape(-1, 3)
     return Illumination(normalise(mean), intensity, spread=np.maximum(spread, 0))
+
+
+def turned(light: Illumination, up: Float, azimuth_deg: float) -> Illumination:
+    """Directional lights turned about `up` (3,), counter-clockwise seen from above: those of an environment turned by as much, whose
+    regions do not hang on where it stands."""
+    turn = Rotation.from_rotvec(np.radians(azimuth_deg) * normalise(np.asarray(up, float))).as_matrix()
+    return replace(light, direction=light.direction @ turn.T)
 
 
 def _energy(sums: Float, top: int, bottom: int, left: int, right: int) -> float:

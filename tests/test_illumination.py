@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mvps.illumination import Illumination, directions_of, environment_lights, frame_of
+from mvps.illumination import Illumination, directions_of, environment_lights, frame_of, turned
 
 UPS = [(0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, -2.0, 0.5)]
 
@@ -45,8 +45,21 @@ def test_regions_have_about_equal_energy_and_a_sun_gets_a_light_of_its_own() -> 
     assert others.max() < 8 * np.median(others)
 
 
+@pytest.mark.parametrize("up", UPS)
+def test_lights_of_a_turned_environment_are_the_lights_turned(up: tuple[float, float, float]) -> None:
+    picture = np.random.default_rng(0).exponential(size=(16, 32, 3)).astype(np.float32)
+    still = environment_lights(picture, 32, np.array(up))
+    for degrees in (0, 1, 90, 215, -30):
+        wanted, found = environment_lights(picture, 32, np.array(up), degrees), turned(still, np.array(up), degrees)
+        np.testing.assert_allclose(found.direction, wanted.direction, atol=1e-14)
+        np.testing.assert_array_equal(found.intensity, wanted.intensity)
+        np.testing.assert_allclose(found.spread, wanted.spread, atol=1e-14)
+    np.testing.assert_array_equal(turned(still, np.array(up), 0).direction, still.direction)
+
+
 def test_a_black_environment_has_no_light() -> None:
-    assert environment_lights(np.zeros((4, 8, 3), np.float32), 8, np.array([0.0, 0.0, 1.0])).direction.shape == (0, 3)
+    up = np.array([0.0, 0.0, 1.0])
+    assert turned(environment_lights(np.zeros((4, 8, 3), np.float32), 8, up), up, 30).direction.shape == (0, 3)
 
 
 def test_lights_join() -> None:

@@ -165,6 +165,22 @@ def test_the_server_traces_environments(address: str, scene: SphereScene) -> Non
     assert np.allclose(first[:, 2], turned[:, 2], atol=1e-5) and np.abs(first - turned).max() > 0.5
 
 
+def test_an_environment_is_cut_into_lights_once(scene: SphereScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    cut: list[float] = []
+
+    def counted(picture: np.ndarray, *rest: Any) -> Illumination:
+        cut.append(float(picture.mean()))
+        return environment_lights(picture, *rest)
+
+    monkeypatch.setattr("mvps.viewer.picture.environment_lights", counted)
+    grey, dim = (np.full((16, 32, 3), level, np.float32) for level in (0.5, 0.25))
+    model = Model(scene.reconstruction, None, {"grey.hdr": grey, "dim.hdr": dim})
+    for query in ("of=grey.hdr", "of=grey.hdr&turn=30", "of=dim.hdr&turn=30", "of=grey.hdr&turn=-90"):
+        model.environment(query)
+    model.picture(urlencode({"scene": json.dumps(SCENE | {"environment": "grey.hdr", "turn": 60})}))
+    assert cut == [0.5, 0.25]
+
+
 SCENE: dict[str, Any] = {
     "eye": [60.0, 0, 0],
     "forward": [-1.0, 0, 0],

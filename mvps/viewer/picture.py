@@ -21,9 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.gleam import Senders
-from mvps.illumination import Illumination, environment_lights
+from mvps.illumination import Illumination, environment_lights, turned
 from mvps.layers import rendered
 from mvps.mesh import lengths, normalise
+from mvps.once import once_for
 from mvps.pbr import srgb_bytes
 from mvps.scene import Camera, CaptureError, Float, Material
 from mvps.viewpoints import ball_around
@@ -96,7 +97,13 @@ def surroundings(environments: Mapping[str, NDArray[np.float32]], name: str, tur
     """The lights that stand for an environment, turned by so many degrees about `up` (3,). CaptureError where there is none."""
     if name not in environments:
         raise CaptureError(f"of: wanted one of {', '.join(environments)}, given {name!r}")
-    return environment_lights(environments[name], ENVIRONMENT_LIGHTS, up, turn % 360)
+    return turned(_cut(environments[name], tuple(np.asarray(up, float).tolist())), up, turn % 360)
+
+
+@once_for
+def _cut(environment: NDArray[np.float32], up: tuple[float, ...]) -> Illumination:
+    """The lights of an environment (height, width, 3) that is not turned: a large one takes seconds, and every move asks for them."""
+    return environment_lights(environment, ENVIRONMENT_LIGHTS, np.array(up))
 
 
 def picture(caster: RayCaster, material: Material, senders: Senders | None, scene: Asked, around: Illumination) -> NDArray[np.uint8]:
