@@ -200,10 +200,32 @@ ROLLED = {"eye": [80.0, 0, 0], "forward": [-1.0, 0, 0], "above": [0.0, 1, 0], "f
 """A camera that holds the world's y upwards, where the page holds its z."""
 
 
+def test_a_lost_picture_is_said_and_comes_back(scene: SphereScene, opened: Opened) -> None:
+    """With the material and the environment that were chosen."""
+    with server(Model(scene.reconstruction, None), 0) as serving:
+        threading.Thread(target=serving.serve_forever, daemon=True).start()
+        page, _ = opened(f"http://127.0.0.1:{serving.server_port}/")
+        page.evaluate("document.getElementById('viewer-exact').style.visibility = 'hidden'")
+        page.select_option("#viewer-material", "gold")
+        page.select_option("#viewer-environment", "studio")
+        page.wait_for_function("['surrounded', 'dressed', 'traced'].every((name) => document.getElementById('viewer').dataset[name])")
+        before = shown(page)
+        page.evaluate("window.lose = document.getElementById('viewer').getContext('webgl2').getExtension('WEBGL_lose_context')")
+        page.evaluate("window.lose.loseContext()")
+        page.wait_for_function("document.getElementById('viewer-said').textContent.startsWith('The graphics processor has lost')")
+        page.locator("#viewer").focus()
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("ArrowRight")
+        page.evaluate("window.lose.restoreContext()")
+        page.wait_for_function("document.getElementById('viewer-said').textContent === ''")
+        assert before.std() > 10 and np.abs(shown(page) - before).mean() < 0.1
+        serving.shutdown()
+
+
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("away_deg", [0, 2])
 def test_a_view_from_above_or_below_can_be_tilted(scene: SphereScene, opened: Opened, side: int, away_deg: float) -> None:
-    """A photograph along the axis that the object is turned about: the model stays in sight, as in the photograph, and follows both ways."""
+    """A photograph along the axis that the object is turned about: the model stays in sight, as it was, and follows both ways."""
     with server(Model(scene.reconstruction, None), 0) as serving:
         threading.Thread(target=serving.serve_forever, daemon=True).start()
         page, said = opened(f"http://127.0.0.1:{serving.server_port}/")

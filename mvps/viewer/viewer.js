@@ -143,41 +143,47 @@
     if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
     return made;
   };
-  const shown = compiled(VERTEX, FRAGMENT), deep = compiled(VERTEX, DEPTH);
   const set = (program, name, kind, ...values) => gl["uniform" + kind](gl.getUniformLocation(program, name), ...values);
 
-  // ---- buffers ----
-  const vertexArray = gl.createVertexArray();
-  gl.bindVertexArray(vertexArray);
+  // ---- what the graphics processor holds, and may lose ----
   // Which of the lights reach a vertex, and which of an environment's, a bit each.
-  const reached = new Uint8Array(4 * V).fill(255), open = new Uint32Array(V);
-  const filled = (values, k) => {
-    const buffer = gl.createBuffer();
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW);
-    gl.enableVertexAttribArray(k);
-    return buffer;
-  };
-  const buffers = ATTRIBUTES.map(([name, size, type], k) => {
-    const buffer = filled(name === "reached" ? reached : arrays[name], k);
-    gl.vertexAttribPointer(k, size, type, true, 0, 0);
-    return buffer;
-  });
-  const bufferOf = (name) => buffers[ATTRIBUTES.findIndex(([of]) => of === name)];
-  const openBuffer = filled(open, ATTRIBUTES.length);
-  gl.vertexAttribIPointer(ATTRIBUTES.length, 1, gl.UNSIGNED_INT, 0, 0);
-  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, arrays.faces, gl.STATIC_DRAW);
+  const reached = new Uint8Array(4 * V).fill(255);
+  let open = new Uint32Array(V);
+  const uploaded = () => {
+    const shown = compiled(VERTEX, FRAGMENT), deep = compiled(VERTEX, DEPTH), vertexArray = gl.createVertexArray();
+    gl.bindVertexArray(vertexArray);
+    const filled = (values, k) => {
+      const buffer = gl.createBuffer();
+      gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.DYNAMIC_DRAW);
+      gl.enableVertexAttribArray(k);
+      return buffer;
+    };
+    const buffers = Object.fromEntries(ATTRIBUTES.map(([name, size, type], k) => {
+      const buffer = filled(name === "reached" ? reached : arrays[name], k);
+      gl.vertexAttribPointer(k, size, type, true, 0, 0);
+      return [name, buffer];
+    }));
+    buffers.open = filled(open, ATTRIBUTES.length);
+    gl.vertexAttribIPointer(ATTRIBUTES.length, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, arrays.faces, gl.STATIC_DRAW);
 
-  const depths = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D_ARRAY, depths);
-  if (!about.served) gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, SIDE, SIDE, MOST);
-  else gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, 1, 1, 1);
-  gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE);
-  [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER].forEach((name) => gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.LINEAR));
-  [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((name) => gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.CLAMP_TO_EDGE));
-  const frame = gl.createFramebuffer();
-  gl.enable(gl.DEPTH_TEST);
+    const depths = gl.createTexture();
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, depths);
+    if (!about.served) gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, SIDE, SIDE, MOST);
+    else gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.DEPTH_COMPONENT24, 1, 1, 1);
+    gl.texParameteri(gl.TEXTURE_2D_ARRAY, gl.TEXTURE_COMPARE_MODE, gl.COMPARE_REF_TO_TEXTURE);
+    [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER].forEach((name) => gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.LINEAR));
+    [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T].forEach((name) => gl.texParameteri(gl.TEXTURE_2D_ARRAY, name, gl.CLAMP_TO_EDGE));
+    gl.enable(gl.DEPTH_TEST);
+    return { shown, deep, vertexArray, buffers, depths, frame: gl.createFramebuffer() };
+  };
+  let { shown, deep, vertexArray, buffers, depths, frame } = uploaded();
+  const refilled = (name, values) => {
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
+    gl.bufferSubData(gl.ARRAY_BUFFER, 0, values);
+  };
 
   // ---- drawing ----
   let sky = [];
@@ -209,6 +215,7 @@
     return product(box, looking(add(centre, light, 2 * radius), light.map((x) => -x), helper));
   };
   const draw = () => {
+    if (gl.isContextLost()) return;
     const across = Math.round(canvas.clientWidth * devicePixelRatio), down = Math.round(canvas.clientHeight * devicePixelRatio);
     if (canvas.width !== across || canvas.height !== down) { canvas.width = across; canvas.height = down; }
     const fromLight = lights.map((light) => lightView(light.direction));
@@ -291,8 +298,7 @@
         if (next >= lights.length) continue;
         const seen = new Uint8Array(await bytesOf("shadow?light=" + words(lights[next].direction)));
         for (let i = 0; i < V; i++) reached[4 * i + next] = seen[i];
-        gl.bindBuffer(gl.ARRAY_BUFFER, bufferOf("reached"));
-        gl.bufferSubData(gl.ARRAY_BUFFER, 0, reached);
+        refilled("reached", reached);
         canvas.dataset.traced = String(Number(canvas.dataset.traced || 0) + 1);
         later();
       }
@@ -339,9 +345,8 @@
     }
     // A later choice may have been answered first.
     if (mine !== surrounding) return;
-    sky = found;
-    gl.bindBuffer(gl.ARRAY_BUFFER, openBuffer);
-    gl.bufferSubData(gl.ARRAY_BUFFER, 0, bits);
+    [sky, open] = [found, bits];
+    refilled("open", open);
     canvas.dataset.surrounded = String(Number(canvas.dataset.surrounded || 0) + 1);
     later();
   };
@@ -355,10 +360,7 @@
     // A later choice may have been answered first.
     if (mine !== dressing) return;
     Object.assign(about, answer.about);
-    ["albedo", "weight", "hue"].forEach((name) => {
-      gl.bindBuffer(gl.ARRAY_BUFFER, bufferOf(name));
-      gl.bufferSubData(gl.ARRAY_BUFFER, 0, found[name]);
-    });
+    ["albedo", "weight", "hue"].forEach((name) => refilled(name, arrays[name] = found[name]));
     canvas.dataset.dressed = String(Number(canvas.dataset.dressed || 0) + 1);
     later();
   };
@@ -465,6 +467,16 @@
   byId("viewer-material")?.addEventListener("change", () => dress().catch(failed));
   ["viewer-environment", "viewer-turn"].forEach((name) => byId(name)?.addEventListener("change", () => surround().catch(failed)));
   new ResizeObserver(later).observe(canvas);
+  canvas.addEventListener("webglcontextlost", (e) => {
+    // Else the browser does not give it back.
+    e.preventDefault();
+    said.textContent = "The graphics processor has lost the picture. If it does not come back, load the page again.";
+  });
+  canvas.addEventListener("webglcontextrestored", () => {
+    try { ({ shown, deep, vertexArray, buffers, depths, frame } = uploaded()); } catch (error) { failed(error); return; }
+    said.textContent = "";
+    later();
+  });
   window.mvpsViewer = {
     look: (through) => { camera = through; from = through.forward.map((x) => -x); later(); },
     // The only light, as it was when a photograph was taken.
