@@ -14,7 +14,9 @@ import pytest
 from sphere_scene import SphereScene, make_sphere
 
 from mvps.report import report_html
+from mvps.scene import Surface
 from mvps.view import Model, server
+from mvps.viewer import STYLE, viewer_html
 
 pytestmark = pytest.mark.browser
 
@@ -132,6 +134,22 @@ def test_the_report_shows_the_model_without_a_server(
     places = [page.locator("main figure img").nth(k).bounding_box() for k in range(2)]
     assert places[0]["y"] == places[1]["y"], "two pictures stand beside each other on a phone"
     assert not said
+
+
+def test_a_model_far_from_the_origin_looks_the_same(scene: SphereScene, tmp_path: Path, opened: Opened) -> None:
+    """Through a photograph's camera too."""
+    surface, pictures = scene.reconstruction.surface, []
+    for away in (0.0, 1e6 * np.ptp(surface.vertices) * np.array([0.5, 0.8, 0.2])):
+        path = tmp_path / f"{len(pictures)}.html"
+        part = viewer_html(Surface(surface.vertices + away, surface.faces), scene.reconstruction.material, np.eye(3)[2], np.eye(3)[0])
+        path.write_text(f'<!DOCTYPE html><meta charset="utf-8"><style>{STYLE}</style>{part}', encoding="utf-8")
+        page, said = opened(path.as_uri())
+        first = shown(page)
+        page.evaluate("camera => window.mvpsViewer.look(camera)", ROLLED | {"eye": (np.array(ROLLED["eye"]) + away).tolist()})
+        pictures.append((first, shown(page)))
+        assert not said
+    for near, far in zip(*pictures, strict=True):
+        assert near.std() > 10 and np.abs(near - far).mean() < 0.1
 
 
 def traced_over(page: Any) -> None:

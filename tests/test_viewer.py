@@ -32,6 +32,7 @@ from mvps.illumination import Illumination, environment_lights
 from mvps.layers import rendered
 from mvps.mesh import decimated, normalise
 from mvps.pbr import srgb_bytes
+from mvps.scene import Surface
 from mvps.view import Model, main, named, server
 from mvps.viewer import carried_over, packed, viewer_html
 from mvps.viewer.environments import MADE, made
@@ -55,7 +56,7 @@ def test_the_page_holds_the_model(scene: SphereScene) -> None:
     assert (len(r.surface.vertices), len(r.surface.faces)) == (V, F) and len(data) == 23 * V + 12 * F
     parts = np.split(np.frombuffer(data, np.uint8), np.cumsum([6 * V, 6 * V, 3 * V, 4 * V, 3 * V, V]))
     low, high = np.array(about["low"]), np.array(about["high"])
-    position = low + parts[0].view("<u2").reshape(V, 3) / 65535 * (high - low)
+    position = np.array(about["centre"]) + low + parts[0].view("<u2").reshape(V, 3) / 65535 * (high - low)
     np.testing.assert_allclose(position, r.surface.vertices, atol=1e-3)
     np.testing.assert_allclose(parts[1].view("<i2").reshape(V, 3) / 32767, r.material.normal, atol=1e-4)
     np.testing.assert_allclose((parts[2].reshape(V, 3) / 255) ** 2 * about["white"], r.material.albedo, atol=0.01)
@@ -65,6 +66,15 @@ def test_the_page_holds_the_model(scene: SphereScene) -> None:
     np.testing.assert_allclose(coloured, r.material.specular_weight, atol=0.005)
     assert about["sharpness"][:2] == [12, 60] and not weight[:, 2:].any()
     np.testing.assert_array_equal(parts[6].view("<u4").reshape(F, 3), r.surface.faces)
+
+
+def test_a_model_far_from_the_origin_is_the_same_in_single_precision(scene: SphereScene) -> None:
+    r = scene.reconstruction
+    away = 1e6 * RADIUS * np.array([0.5, 0.8, 0.2])
+    near, far = (packed(Surface(r.surface.vertices + at, r.surface.faces), r.material)[0] for at in (0, away))
+    for name in ("low", "high"):
+        np.testing.assert_allclose(np.array(far[name], np.float32), near[name], atol=1e-6 * RADIUS)
+    np.testing.assert_allclose(np.array(far["centre"]) - near["centre"], away)
 
 
 def test_lobes_may_have_another_colour_at_every_place(scene: SphereScene) -> None:

@@ -14,6 +14,8 @@ Data, one array after the other, compressed by deflate (RFC 1950), written in ba
     albedo    (V, 3) uint8    square root, over `white`            weight  (V, 4) uint8 square root, over `lobe_white`, 0 beyond the lobes
     hue       (V, 3) uint8    square root, over `hue_white`, times the lobes' colours of the object in the mean
     confidence  (V,) uint8                                         faces   (F, 3) uint32
+
+The box's corners, and all that the graphics processor is given, are relative to its `centre` in the world.
 """
 
 from __future__ import annotations
@@ -61,6 +63,8 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
     Lobes beyond MOST_LOBES, which an edited material may have, are left out, the faintest first.
     """
     low, high = surface.vertices.min(0), surface.vertices.max(0)
+    # Graphics processors have single precision: far from the world's origin it would not tell vertices apart.
+    centre = (low + high) / 2
     span = np.maximum(high - low, 1e-300)
     weight = material.specular_weight if material.specular_weight.ndim == 3 else material.specular_weight[..., None].repeat(3, 2)
     kept = np.sort(np.argsort(-weight.sum((0, 2)), kind="stable")[:MOST_LOBES])
@@ -86,8 +90,9 @@ def packed(surface: Surface, material: Material) -> tuple[dict[str, Any], bytes]
     about = {
         "vertices": len(surface.vertices),
         "faces": len(surface.faces),
-        "low": low.tolist(),
-        "high": high.tolist(),
+        "centre": centre.tolist(),
+        "low": (low - centre).tolist(),
+        "high": (high - centre).tolist(),
         "white": white,
         "lobe_white": lobe_white.tolist(),
         "hue_white": hue_white,

@@ -39,12 +39,12 @@
       -dot(right, eye), -dot(above, eye), dot(forward, eye), 1];
   };
 
-  // ---- state ----
+  // ---- state, in the model's own frame: the world's, from the middle of its box ----
   const centre = about.low.map((x, i) => (x + about.high[i]) / 2);
   const radius = Math.hypot(...about.low.map((x, i) => about.high[i] - x)) / 2;
   const up = unit(about.up);
   let from = unit(about.from), distance = 4.2 * radius;
-  // A photograph's camera, until the object is turned: eye, forward, above (world); focal, middle, size (pixels, x and y).
+  // A photograph's camera, until the object is turned: eye, forward, above; focal, middle, size (pixels, x and y).
   let camera = null;
   const aside = cross(up, from);
   const placed = [[0.5, 0.5], [0.5, -0.8], [-0.3, 0.9], [1.2, 0]].map(([high, right]) => unit(add(add(from, up, high), aside, right)));
@@ -312,8 +312,9 @@
     if (tracing || !layer || stale.size || asking) return;
     tracing = true;
     const then = canvas.dataset.drawn, size = [canvas.width, canvas.height];
+    const seen = seenBy(...size);
     const scene = {
-      ...seenBy(...size), size, layer, lights: lights.map(({ direction, colour }) => ({ direction, colour })),
+      ...seen, eye: add(seen.eye, about.centre), size, layer, lights: lights.map(({ direction, colour }) => ({ direction, colour })),
       fill: Number(byId("viewer-fill").value), environment: byId("viewer-environment").value, turn: Number(byId("viewer-turn").value),
       material: byId("viewer-material").value, exposure: exposure(),
     };
@@ -478,7 +479,12 @@
     later();
   });
   window.mvpsViewer = {
-    look: (through) => { camera = through; from = through.forward.map((x) => -x); later(); },
+    // through: in the world's frame.
+    look: (through) => {
+      camera = { ...through, eye: add(through.eye, about.centre, -1) };
+      from = through.forward.map((x) => -x);
+      later();
+    },
     // The only light, as it was when a photograph was taken.
     lightFrom: (direction, colour) => {
       const most = Math.max(...colour, 1e-12), code = (c) => Math.round(255 * (c <= 0.0031308 ? 12.92 * c : 1.055 * c ** (1 / 2.4) - 0.055));
