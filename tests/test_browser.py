@@ -13,6 +13,9 @@ import numpy as np
 import pytest
 from sphere_scene import SphereScene, make_sphere
 
+from mvps.compare.curve import Point, drawing
+from mvps.compare.page import page_html
+from mvps.compare.tables import COLUMNS
 from mvps.report import report_html
 from mvps.scene import Surface
 from mvps.view import Model, server
@@ -212,6 +215,20 @@ def test_the_first_photograph_is_taken_over_at_once(scene: SphereScene, opened: 
         assert np.abs(first - again).mean() < 0.1
         serving.shutdown()
     assert not said
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_curves_are_read_on_their_paper_and_leave_the_page_alone(tmp_path: Path, browser: Any, scheme: str) -> None:
+    curve = drawing([Point(10, 0.1, "ours"), Point(100, 0.3, "hull")], COLUMNS[4])
+    path, style = tmp_path / "page.html", "getComputedStyle(document.querySelector('{}')).{}"
+    path.write_text(page_html("x", {"ours": [["a", "b"], ["1", "2"]]}, {"c": curve, "d": '<svg id="d"><text>x</text></svg>'}, None))
+    page = browser.new_page(color_scheme=scheme)
+    page.goto(path.as_uri())
+    assert page.evaluate(style.format("svg.curve text", "fill")) == "rgb(34, 34, 34)"
+    assert page.evaluate(style.format("svg.curve .axis", "stroke")) == "rgb(34, 34, 34)"
+    assert page.evaluate(style.format("#d text", "fill")) == page.evaluate(style.format("body", "color"))
+    assert page.evaluate(style.format("#d text", "fontFamily")) == page.evaluate(style.format("body", "fontFamily"))
+    page.close()
 
 
 ROLLED = {"eye": [80.0, 0, 0], "forward": [-1.0, 0, 0], "above": [0.0, 1, 0], "focal": [100.0, 100], "middle": [32.0, 24], "size": [64, 48]}

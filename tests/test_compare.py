@@ -206,6 +206,9 @@ def test_curve_joins_our_budgets_and_names_all() -> None:
     assert [t.text for t in root.iter("{http://www.w3.org/2000/svg}text")].count("hull") == 1
     (line,) = root.iter("{http://www.w3.org/2000/svg}polyline")
     assert len(line.attrib["points"].split()) == 2
+    # Its style is of itself alone: it stands in pages with styles of their own.
+    rules = text.partition("<style>")[2].partition("</style>")[0]
+    assert root.attrib["class"] == "curve" and all(rule.startswith(".curve ") for rule in rules.split("}")[:-1])
     assert dominated(points_of(runs, "chamfer_px")) == {"hull": False}
     assert dominated([Point(60, 0.1, "slow"), *points_of(runs, "chamfer_px")]) == {"slow": True, "hull": False}
     assert ticks(0.9, 6) == [1, 2, 5]

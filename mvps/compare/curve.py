@@ -17,9 +17,10 @@ MEASURES = ("mesh_normal_error_deg", "chamfer_px")
 """Keys of the errors that are drawn."""
 
 STYLE = (
-    "<style>text{font:12px sans-serif;fill:#222}.axis{stroke:#222;fill:none}.grid{stroke:#ddd}"
-    ".ours{stroke:#06c;fill:none;stroke-width:2}.own{fill:#06c}.other{fill:#c40}</style>"
+    "<style>.curve text{font:12px sans-serif;fill:#222}.curve .axis{stroke:#222;fill:none}.curve .grid{stroke:#ddd}"
+    ".curve .ours{stroke:#06c;fill:none;stroke-width:2}.curve .own{fill:#06c}.curve .other{fill:#c40}</style>"
 )
+"""Of the drawing alone, which stands in pages that have a style of their own."""
 
 
 class Point(NamedTuple):
@@ -71,7 +72,7 @@ def drawing(points: Sequence[Point], column: Column) -> str:
     label = f"{column.title} over seconds: " + ", ".join(f"{p.name} {p.seconds:.0f} s {e:.3g}" for p, e in zip(points, y, strict=True))
     picture = [f'<rect width="{WIDTH}" height="{HEIGHT}" fill="#fff"/>', *grid, f'<path class="axis" d="M{LEFT} {TOP}V{base}H{end}"/>']
     picture += [f'<polyline class="ours" points="{line}"/>', *dots, *labels]
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">'
+    head = f'<svg class="curve" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(label)}">'
     return f"{head}{STYLE}{''.join(picture)}</svg>\n"
 
 
