@@ -230,13 +230,15 @@ def gathered(sources: Sources, lit: NDArray[np.float32], bounce: float) -> NDArr
 
 def interpolation(of: Gather, points: Float, normal: Float) -> sp.csr_matrix:
     """(points, n) weights of the patches at points with normals (points, 3): inverse squared distance, facing the same way."""
-    distance, index = neighbours(of.tree, points, NEIGHBOURS)
+    # A small mesh has fewer patches.
+    near_by = min(NEIGHBOURS, len(of.normal))
+    distance, index = (found.reshape(len(points), near_by) for found in neighbours(of.tree, points, near_by))
     near = 1e-3 * float(np.median(distance)) + 1e-300
     # Axis by axis: numpy's loops are slow along an axis of three.
     facing = sum(normal[:, k, None] * np.take(of.normal[:, k], index) for k in range(3))
     weight = np.maximum(facing, 0.05) / np.maximum(distance, near) ** 2
     weight /= weight.sum(1, keepdims=True)
-    ends = np.arange(0, index.size + 1, NEIGHBOURS)
+    ends = np.arange(0, index.size + 1, near_by)
     return sp.csr_matrix((weight.astype(np.float32).ravel(), index.ravel(), ends), (len(points), len(of.normal))).sorted_indices()
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, gathered, lit_by, sources_on
+from mvps.bounce import PATCH_EDGES, Gather, Sources, gather, gathered, interpolation, lit_by, sources_on
 from mvps.gleam import Senders, terms_of_points
 from mvps.mesh import mean_edge_length, vertex_normals
 from mvps.scene import Law, Surface
@@ -110,6 +110,20 @@ def test_colours_mix_channel_by_channel_and_interpolate_to_points() -> None:
     values = sent.at(room.vertices, vertex_normals(room))[:, :, 0]
     assert values.shape == (len(room.vertices), 2, 3)
     assert (values >= 0.999 * G.min((0, 1))).all() and (values <= 1.001 * G.max((0, 1))).all()
+
+
+@pytest.mark.parametrize("patches", [1, 2, 3, 4])
+def test_a_mesh_of_few_patches(patches: int) -> None:
+    """Triangles side by side, each about as large as a patch: all have one albedo, and weights of every point sum to 1."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    vertices = np.concatenate([corners + np.array([10 * k, 0, 0]) for k in range(patches)])
+    surface = Surface(vertices, np.arange(3 * patches).reshape(-1, 3))
+    sources = sources_on(gather(surface, 10.0, 10.0), surface, np.full(3 * patches, 0.5))
+    assert sources.albedo.shape == (patches,)
+    np.testing.assert_allclose(sources.albedo, 0.5, rtol=1e-6)
+    weights = interpolation(sources.of, vertices + 0.1, vertex_normals(surface))
+    np.testing.assert_allclose(np.asarray(weights.sum(1)), 1, rtol=1e-6)
+    assert (np.diff(weights.indptr) == patches).all()
 
 
 def test_patches_are_the_same_traced_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
