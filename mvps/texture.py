@@ -43,6 +43,9 @@ LARGEST_SIDE = 4096
 """Textures larger than this, texels, do not load on every graphics card."""
 FILLED = 0.4
 """Share of an atlas that charts cover, about; used only to keep below LARGEST_SIDE."""
+REBUILT = 3
+"""Times that an atlas is made again, coarser, because it came out larger than that: many small charts fill less, and the room between
+them, which is so many texels, stays."""
 SAMPLES_PER_CHUNK = 1 << 16
 TEXELS_PER_CHUNK = 1 << 18
 REWEIGHTINGS = 4
@@ -118,9 +121,17 @@ def bake(
 
 
 def _charted(surface: Surface, shell: Surface, texel: float) -> tuple[Atlas, Texels, Texels]:
-    """The shell's atlas with texels of about this side, its texels, and those with the faces of the surface that they show."""
+    """The shell's atlas with texels of about this side, coarser where it would be larger than LARGEST_SIDE, its texels, and those with the
+    faces of the surface that they show."""
     smallest = np.sqrt(face_areas(shell).sum() / FILLED) / LARGEST_SIDE
-    atlas = build_atlas(shell, max(texel, float(smallest)))
+    texel = max(texel, float(smallest))
+    atlas = build_atlas(shell, texel)
+    for _ in range(REBUILT):
+        side = max(atlas.height, atlas.width)
+        if side <= LARGEST_SIDE:
+            break
+        texel *= 1.02 * side / LARGEST_SIDE
+        atlas = build_atlas(shell, texel)
     texels = rasterise(atlas.uv, atlas.faces, atlas.height, atlas.width)
     if shell is surface:
         return atlas, texels, texels

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 from references import linear_from_srgb
 from sphere_scene import RADIUS, SphereScene, colours, make_sphere
 
-from mvps.atlas import Atlas, rasterise
+from mvps.atlas import Atlas, build_atlas, rasterise
 from mvps.gltf import glb_bytes, metallic_roughness
 from mvps.joint.stated import icosahedron
 from mvps.mesh import decimated, nearest, normalise, vertex_normals
 from mvps.pbr import glossy
 from mvps.rendering import photograph, points_under
 from mvps.scene import Capture, Lights, Material, Surface, View
-from mvps.texture import Textures, _robust_albedo, bake, pixel_albedo, png_bytes
+from mvps.texture import Textures, _charted, _robust_albedo, bake, pixel_albedo, png_bytes
 from mvps.visibility import RayCaster
 
 
@@ -163,6 +163,21 @@ def test_a_shell_shows_the_full_surface_by_its_pictures(scene: SphereScene) -> N
     clear = np.abs(found.point[:, 0]) > 2.5
     error = np.abs(albedo_of(level)[row, column] - colours(found.point))[clear].max(1)
     assert np.median(error) < 0.01 and np.percentile(error, 99) < 0.05
+
+
+@pytest.mark.parametrize("largest", [64, 128, 256])
+@pytest.mark.parametrize("seed", [None, 0])
+def test_no_atlas_is_larger_than_graphics_cards_load(monkeypatch: pytest.MonkeyPatch, largest: int, seed: int | None) -> None:
+    """Of a ball and of a rough one, whose charts are many and small: coarser than asked for, by no more than it must."""
+    surface = make_sphere(4).reconstruction.surface
+    if seed is not None:
+        roughness = np.random.default_rng(seed).normal(size=(len(surface.vertices), 1))
+        surface = replace(surface, vertices=surface.vertices * (1 + 0.02 * roughness))
+    monkeypatch.setattr("mvps.texture.LARGEST_SIDE", largest)
+    atlas, texels, _ = _charted(surface, surface, 1e-3)
+    assert 0.8 * largest < max(atlas.height, atlas.width) <= largest and len(texels.face)
+    fits = 4 * np.ptp(surface.vertices) / largest
+    np.testing.assert_array_equal(_charted(surface, surface, fits)[0].uv, build_atlas(surface, fits).uv)
 
 
 def test_normal_map_decodes_to_the_refined_normals(scene: SphereScene, baked: Textures) -> None:
