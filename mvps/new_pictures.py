@@ -1,8 +1,9 @@
 """Pictures of a result from any camera under any light, as files: the whole way behind mvps.render's cameras and lights.
 
 A file a camera and layer, CAMERA_LAYER.png: 8-bit sRGB with coverage as transparency, 16-bit linear, or EXR with the values as they are
-(radiance, world units, unit vectors). In PNG normals are (n + 1) / 2 and depth is near white to far black, from the nearest to the
-farthest point of all the pictures. Videos show what the 8-bit PNGs do, whatever the pictures' format.
+(radiance, world units, unit vectors). In PNG normals are (n + 1) / 2, depth is near white to far black, from the nearest to the
+farthest point of all the pictures, and albedo is over the object's white before any edit, as in the report, the meshes and edits. Videos
+show what the 8-bit PNGs do, whatever the pictures' format.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from mvps.illumination import Illumination, environment_lights
 from mvps.layers import PIXELS_AT_A_TIME, Layer, rendered
 from mvps.load import read_environment
 from mvps.mesh import lengths, normalise
-from mvps.pbr import srgb_bytes, white_level
+from mvps.pbr import reflectance_scale, srgb_bytes, white_level
 from mvps.progress import Progress
 from mvps.render import LARGEST
 from mvps.rendering import light_senders
@@ -52,11 +53,12 @@ LIGHT = ("image", "specular")
 
 class Range(NamedTuple):
     """Of the values that all pictures of a command show: the factor of radiance, 0 while it is not known; depths that are white and
-    black."""
+    black; the albedo that is white."""
 
     exposure: float
     nearest: float
     farthest: float
+    white: float
 
 
 def write_pictures(given: Namespace) -> None:
@@ -82,7 +84,8 @@ def write_pictures(given: Namespace) -> None:
     with appearing_whole(given.out) as writing, np.errstate(all="ignore"):
         frames = writing / ".frames" if given.video and given.format != "png" else writing
         frames.mkdir(exist_ok=True)
-        shown = Range(given.exposure if "exposure" in given else 0.0, *depths_of(given, caster, material, cameras))
+        depths = depths_of(given, caster, material, cameras)
+        shown = Range(given.exposure if "exposure" in given else 0.0, *depths, reflectance_scale(result.material))
         with Progress().stage("render", total=len(cameras)) as stage:
             for name, camera in cameras.items():
                 light = chosen_light(given, camera, environment, ball_around(result.surface)[0])
@@ -188,7 +191,9 @@ def as_shown(layer: str, values: Layer, coverage: Layer, shown: Range) -> Layer:
     if layer == "depth":
         depth: Layer = 1 - (values - shown.nearest) / max(shown.farthest - shown.nearest, 1e-12)
         return np.where(coverage > 0, depth, 0).astype(np.float32)
-    return values * np.float32((shown.exposure or 1.0) if layer in ("image", "specular") else 1.0)
+    if layer == "albedo":
+        return values / np.float32(shown.white)
+    return values * np.float32((shown.exposure or 1.0) if layer in LIGHT else 1.0)
 
 
 def write_layer(folder: Path, name: str, layer: str, values: Layer, coverage: Layer, shown: Range, form: str) -> None:

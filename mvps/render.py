@@ -208,7 +208,7 @@ def options() -> Any:
     lights.add_argument("--frame", choices=("world", "camera"), default="world", help=FRAME_HELP)
     lights.add_argument("--no-bounce", action="store_true", help="without light that surfaces send each other")
     pictures = made.add_argument_group("pictures")
-    pictures.add_argument("--layers", type=layer_list, default=("image",), metavar="NAMES", help=f"some of {','.join(LAYERS)}")
+    pictures.add_argument("--layers", type=layer_list, default=("image",), metavar="NAMES", help=LAYERS_HELP)
     pictures.add_argument("--format", choices=FORMATS, default="png", help="8-bit sRGB, 16-bit linear, or EXR: values as they are")
     pictures.add_argument(
         "--exposure",
@@ -226,7 +226,8 @@ CAMERAS_HELP = 'JSON: {"cameras": [{"name", "K", "rotation", "translation", "wid
 POINT_HELP = "place of a point of light, world units; its intensity at the object's middle"
 UP = (0.0, 0.0, 1.0)
 UP_HELP = "upwards in the world, for --camera, --turntable and --envmap"
-EXPOSURE_HELP = "factor of radiance; if left out, highlights of the first picture that shows the object become white"
+LAYERS_HELP = f"some of {','.join(LAYERS)}; albedo in PNG and videos is over the object's white, whatever --exposure is"
+EXPOSURE_HELP = "factor of radiance, in image and specular; if left out, highlights of the first picture that shows the object become white"
 FRAME_HELP = "of --light and --point; camera: x right, y up, z towards the camera, fixed to each camera, its origin in the object's middle"
 OWN = ("camera", "turntable", "cameras", "envmap")
 

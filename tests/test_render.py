@@ -17,6 +17,7 @@ from mvps.command import run
 from mvps.export import write_reconstruction
 from mvps.load import read_environment
 from mvps.new_pictures import Range, write_layer
+from mvps.pbr import reflectance_scale, srgb_bytes
 from mvps.render import main, render_view
 from mvps.rendering import RAYS_ACROSS
 from mvps.scene import Camera, CaptureError, Lights, Truth, View
@@ -270,13 +271,35 @@ def test_light_of_pixels_that_are_covered_in_part(tmp_path: Path) -> None:
     values, coverage = np.full((1, 3, 3), 0.5, np.float32), np.array([[0.0, 0.25, 1.0]], np.float32)
     for layer, wanted in (("image", 0.5 * coverage[0]), ("albedo", np.full(3, 0.5))):
         for form in ("exr", "png16", "png"):
-            write_layer(tmp_path, form, layer, values, coverage, Range(1.0, 0.0, 1.0), form)
+            write_layer(tmp_path, form, layer, values, coverage, Range(1.0, 0.0, 1.0, 1.0), form)
         channels = OpenEXR.File(str(tmp_path / "exr.exr")).channels()
         found = channels["RGB"].pixels if "RGB" in channels else channels["RGBA"].pixels
         np.testing.assert_allclose(found[0, :, 1], wanted)
         np.testing.assert_allclose(image(tmp_path / "png16.png")[0, :, 1] / 65535, wanted, atol=1e-4)
         stored = cv2.imread(str(tmp_path / "png.png"), cv2.IMREAD_UNCHANGED)
         assert stored is not None and set(stored[0, :, 1].tolist()) == {188}
+
+
+@pytest.mark.parametrize("stops", [0, 6])
+def test_albedo_in_png_is_over_the_object_s_white(scene: SphereScene, tmp_path: Path, stops: int) -> None:
+    """However dark the capture: a colour that an edit gives comes out as it was given, and EXR has the material's own values."""
+    material = scene.reconstruction.material
+    darker = replace(material, albedo=material.albedo / 2**stops, specular_weight=material.specular_weight / 2**stops)
+    write_reconstruction(replace(scene.reconstruction, material=darker), tmp_path / "result")
+    (tmp_path / "edits.json").write_text('{"edits": [{"preset": "matte"}, {"albedo": {"colour": [0.5, 0.25, 0.125]}}]}')
+    camera = ["--camera", "400,0,0", "--size", "40x40", "--layers", "albedo", "--exposure", "16"]
+    folders = (tmp_path / "result", tmp_path)
+    for form in ("png", "png16", "exr"):
+        rendered_files(folders, tmp_path / form, *camera, "--format", form)
+        rendered_files(folders, tmp_path / "edited" / form, *camera, "--format", form, "--edit", str(tmp_path / "edits.json"))
+    white = reflectance_scale(darker)
+    for folder, wanted in ((tmp_path / "edited", np.array([0.5, 0.25, 0.125])), (tmp_path, None)):
+        found = read_environment(folder / "exr" / "camera_albedo.exr")[15:25, 15:25] / white
+        if wanted is not None:
+            np.testing.assert_allclose(found, np.broadcast_to(wanted, found.shape), rtol=1e-5)
+        np.testing.assert_allclose(image(folder / "png16" / "camera_albedo.png")[15:25, 15:25] / 65535, found, atol=1e-5)
+        coloured = cv2.imread(str(folder / "png" / "camera_albedo.png"))[15:25, 15:25, ::-1]
+        np.testing.assert_allclose(coloured, srgb_bytes(found), atol=1)
 
 
 def test_a_light_fixed_to_the_camera_and_an_edit(folders: tuple[Path, Path], tmp_path: Path) -> None:
