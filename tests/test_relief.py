@@ -11,7 +11,7 @@ import pytest
 from mvps.camera import pixel_centres, rays
 from mvps.load import read_capture, read_truth
 from mvps.mesh import angles_deg, face_normals, normalise
-from mvps.relief.ambiguity import factors, resolved
+from mvps.relief.ambiguity import factors, outer_band, resolved
 from mvps.relief.integrate import integrate
 from mvps.relief.silhouette import inflated_normals
 from mvps.relief.surface import pixel_surface
@@ -127,6 +127,39 @@ def test_the_mesh_lies_at_its_distance_and_faces_the_camera() -> None:
 def test_an_inflated_disc_is_a_ball() -> None:
     mask, _, normal = ball()
     assert angles_deg(inflated_normals(mask), normal).mean() < 3
+
+
+@pytest.mark.parametrize("shown", [(slice(None), slice(40)), (slice(24, None), slice(None)), (slice(20, None), slice(44))])
+def test_a_ball_that_the_frame_cuts_off_is_inflated_to_one(shown: tuple[slice, slice]) -> None:
+    """Its right, its top, or both."""
+    mask, _, normal = ball()
+    everywhere = np.full((*mask.shape, 3), np.nan)
+    everywhere[mask] = normal
+    part = mask[shown]
+    assert any(edge.any() for edge in (part[0], part[-1], part[:, 0], part[:, -1]))
+    off = angles_deg(inflated_normals(part), everywhere[shown][part])
+    assert off.mean() < 3 and np.quantile(off, 0.95) < 12
+    # Pixels near the outline are those of the whole ball's.
+    view = View(
+        "view_01",
+        replace(CAMERA, height=part.shape[0], width=part.shape[1]),
+        part,
+        np.zeros((int(part.sum()), 1, 3), np.uint16),
+        1.0,
+        1,
+        (1,),
+    )
+    near, outer = np.zeros(part.shape, bool), np.zeros(mask.shape, bool)
+    near[tuple(view.pixels[outer_band(view)].T)] = True
+    whole = View("view_01", CAMERA, mask, np.zeros((int(mask.sum()), 1, 3), np.uint16), 1.0, 1, (1,))
+    outer[tuple(whole.pixels[outer_band(whole)].T)] = True
+    assert (near & ~outer[shown]).sum() < 0.1 * near.sum()
+
+
+def test_a_frame_all_around_but_for_a_hole_has_normals_too() -> None:
+    mask = np.ones((20, 30), bool)
+    mask[8:12, 10:14] = False
+    assert np.isfinite(inflated_normals(mask)).all()
 
 
 def photographed(mask: np.ndarray, normal: np.ndarray, albedo: np.ndarray, lights: int, seed: int) -> tuple[View, np.ndarray]:

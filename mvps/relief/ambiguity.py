@@ -150,8 +150,9 @@ def factors_under(view: View, lights: Float, colour: Float | None = None) -> Pse
 
 
 def outer_band(view: View) -> Int:
-    """(n,) pixels near the outline, not on it where they mix: 1.5 pixels deep, up to a tenth of the mask's radius, at least 4."""
-    padded = np.pad(view.mask.astype(np.uint8), 1)
+    """(n,) pixels near the outline, not on it where they mix: 1.5 pixels deep, up to a tenth of the mask's radius, at least 4. The frame,
+    where it cuts the mask off, is no outline."""
+    padded = np.pad(view.mask.astype(np.uint8), 1, mode="edge")
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1][view.mask]
     radius = np.sqrt(view.mask.sum() / np.pi)
     return np.flatnonzero((depth > 1.5) & (depth <= max(4.0, 0.1 * radius)))
