@@ -107,8 +107,19 @@ def tells_of_hollows(capture: Capture, found: Refined) -> bool:
     from mvps.material import POOR_FIT
     from mvps.noise import samples_noise
 
+    if not outnumbers_unknowns(capture, found.surface):
+        return False
     left = float(np.nanmedian(beyond_noise(found.unexplained, samples_noise(capture))))
     return found.rounds[-1]["residual"] <= POOR_FIT and left <= SIGNS * POOR_FIT
+
+
+def outnumbers_unknowns(capture: Capture, surface: Surface) -> bool:
+    """Whether half of what is seen is in more photographs than a vertex has unknowns: no more than that fit nearly any normal and albedo,
+    and what they leave compares no surfaces."""
+    from mvps.joint.pixels import few_lights
+    from mvps.verdict import UNKNOWNS, photographs, seen_by
+
+    return not few_lights(capture) or photographs(capture, surface, seen_by(capture, surface)) > UNKNOWNS
 
 
 def in_turn(

@@ -287,9 +287,21 @@ def test_where_little_fits_no_misfit_is_a_sign(left: float, noise: float, told: 
     """What is left of most vertices is the model's fault, unless it is noise; and of a model that fits badly with its noise nothing is."""
     monkeypatch.setattr("mvps.noise.samples_noise", lambda _: noise)
     unexplained = np.array([left, left, left, 0.9, np.nan])
-    found: Any = SimpleNamespace(unexplained=unexplained, rounds=[{"residual": 0.5}, {"residual": left}])
-    capture: Any = None
-    assert tells_of_hollows(capture, found) is told
+    scene = make_sphere(3)
+    found: Any = SimpleNamespace(
+        surface=scene.reconstruction.surface, unexplained=unexplained, rounds=[{"residual": 0.5}, {"residual": left}]
+    )
+    assert tells_of_hollows(scene.capture, found) is told
+
+
+@pytest.mark.parametrize(("lights", "told"), [(1, False), (2, True), (4, True)])
+def test_no_more_photographs_than_unknowns_say_nothing_of_hollows(lights: int, told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of six views along the axes three see most of a ball, and no place shows in more."""
+    monkeypatch.setattr("mvps.noise.samples_noise", lambda _: 0.0)
+    scene = make_sphere(3)
+    surface, some = scene.reconstruction.surface, tuple(range(1, lights + 1))
+    found: Any = SimpleNamespace(surface=surface, unexplained=np.full(len(surface.vertices), 0.01), rounds=[{"residual": 0.01}])
+    assert tells_of_hollows(scene.capture.select({view.name: some for view in scene.capture.views}), found) is told
 
 
 def test_a_vessel_is_hollow() -> None:
