@@ -53,7 +53,8 @@ def photographed_outside(sample: Sample, given: Path) -> None:
             image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
             image[lost] = before.samples[before.pixel_index[lost], k, ::-1]
             if sample.behind:
-                image[~before.mask & ~after.mask] = sample.behind(before)[k, ::-1]
+                beside = ~before.mask & ~after.mask
+                image[beside] = sample.behind(before, k, int(beside.sum()))[:, ::-1]
             cv2.imwrite(str(path), image)
 
 

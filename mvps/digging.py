@@ -71,7 +71,7 @@ def hollowed(
     """
     from mvps.camera import surface_pixel
     from mvps.device import chosen_device
-    from mvps.hollows import beyond_noise, dug, hidden, misfit, solid
+    from mvps.hollows import beyond_noise, dug, hidden, solid
     from mvps.hull import visual_hull
     from mvps.mesh import piece_count
     from mvps.occupancy import CONTINUED, Occupancy
@@ -82,8 +82,7 @@ def hollowed(
     def unexplained(of: Refined) -> Float:
         return beyond_noise(of.unexplained, noise)
 
-    def left(of: Refined) -> float:
-        return misfit(capture, of.surface, unexplained(of))
+    left = _judge(capture, found, noise)
 
     def deeper(of: Refined, share: float) -> Refined | None:
         if hidden(of.surface, unexplained(of)) <= (HIDDEN if of is found else LEFT) * pixel:
@@ -112,13 +111,28 @@ def hollowed(
     return best, rounds
 
 
+def _judge(capture: Capture, found: Refined, noise: float) -> Callable[[Refined], float]:
+    """What a solution leaves (`misfit`): all, 1, where it covers less of the masks than the one found, by as much as a part of the object
+    covers alone. A pit through a thin wall takes this away, and what is left of the surface may fit.
+    """
+    from mvps.hollows import beyond_noise, misfit
+    from mvps.hull import ALONE, covered
+
+    least = covered(found.surface, capture) - ALONE * sum(len(view.pixels) for view in capture.views)
+
+    def left(of: Refined) -> float:
+        return misfit(capture, of.surface, beyond_noise(of.unexplained, noise)) if covered(of.surface, capture) >= least else 1.0
+
+    return left
+
+
 def pitted(
     capture: Capture, grid: SignedDistanceGrid, found: Refined, settings: Settings, of_turn: RefineSettings, progress: Progress
 ) -> tuple[Refined, Rounds]:
     """Stage II with pits dug that are too narrow to be `hollowed`, and the rounds that this took: Stage I would fill them again in part. As
     it was found where there are none, or where the model explains no more of the photographs with them."""
     from mvps.camera import surface_pixel
-    from mvps.hollows import beyond_noise, dug, mean_depth, misfit, pits
+    from mvps.hollows import beyond_noise, dug, mean_depth, pits
     from mvps.hull import visual_hull
     from mvps.mesh import piece_count
     from mvps.plan import COARSE, once
@@ -127,8 +141,7 @@ def pitted(
     # A single vertex that does not fit is as wide as edges are.
     least = grid.spacing * max(one.edge for one in of_turn.rounds) / COARSE.edge
 
-    def left(of: Refined) -> float:
-        return misfit(capture, of.surface, beyond_noise(of.unexplained, noise))
+    left = _judge(capture, found, noise)
 
     def deeper(of: Refined) -> Refined | None:
         unexplained = beyond_noise(of.unexplained, noise)

@@ -20,7 +20,7 @@ from skimage.measure import marching_cubes
 
 from mvps.camera import pixel_footprint, project
 from mvps.cores import on_cores
-from mvps.mesh import chosen_pieces, face_areas, labelled_pieces, largest_pieces
+from mvps.mesh import chosen_pieces, face_areas, labelled_pieces, largest_pieces, lengths
 from mvps.once import once_for
 from mvps.scene import Bool, Capture, CaptureError, Float, SignedDistanceGrid, Surface, View
 from mvps.silhouette import beyond_mask, mask_distances
@@ -118,10 +118,12 @@ def bounds(capture: Capture, frame_open: bool) -> tuple[Float, Float]:
 
 
 def _distance(view: View, field: NDArray[np.float32], points: Float, frame_open: bool) -> NDArray[np.float32]:
-    """Signed distance of world points (n, 3) to one view's silhouette cone, world units, -inf where the view cannot tell."""
+    """Signed distance of world points (n, 3) to one view's silhouette cone, world units, -inf where the view cannot tell; behind a
+    camera, where the grid's nodes may be if it stands near the object, that to its plane and a pixel more."""
     image, depth = project(view.camera, points)
     beyond = beyond_mask(view.camera, field, image, frame_open) * depth / view.camera.focal_length
-    return np.where(depth > 0, beyond, np.inf).astype(np.float32)
+    behind = -depth + lengths(points - view.camera.centre) / view.camera.focal_length
+    return np.where(depth > 0, beyond, behind).astype(np.float32)
 
 
 class _Masks:

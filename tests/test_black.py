@@ -71,7 +71,7 @@ def test_every_channel_has_its_own(tmp_path: Path) -> None:
 
 
 def test_clipped_samples_stay_clipped(tmp_path: Path) -> None:
-    given = photographed(tmp_path / "given", lambda image, mask, light: np.minimum(0.05 + 1.5 * image, 1))
+    given = photographed(tmp_path / "given", lambda image, mask, light: by_a_camera(0.05)(1.6 * image, mask, light))
     mended, found = black_level(given)
     assert found and not all(view.usable().all() for view in given.views)
     for before, after in zip(given.views, mended.views, strict=True):
@@ -96,6 +96,11 @@ def cut_out(image: Float, mask: Bool, light: int) -> Float:
     return np.where(mask[..., None], image, 0.05)
 
 
+def cut_out_under_frontal_light(image: Float, mask: Bool, light: int) -> Float:
+    """The same where no part of the object is as dark."""
+    return np.where(mask[..., None], 0.1 + image, 0.05)
+
+
 def before_a_wall(image: Float, mask: Bool, light: int) -> Float:
     return np.where(mask[..., None], image, image[mask].mean())
 
@@ -104,7 +109,7 @@ def as_it_was(image: Float, mask: Bool, light: int) -> Float:
     return image + np.abs(RNG.normal(0, 0.002, image.shape))
 
 
-@pytest.mark.parametrize("change", [stray, cut_out, before_a_wall, as_it_was])
+@pytest.mark.parametrize("change", [stray, cut_out, cut_out_under_frontal_light, before_a_wall, as_it_was])
 def test_photographs_without_stay_as_they_are(change: Change, tmp_path: Path) -> None:
     given = photographed(tmp_path / "given", change)
     after, found = black_level(given)

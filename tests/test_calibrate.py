@@ -71,6 +71,22 @@ def test_distance_to_a_straight_mask_is_exact_and_half_a_pixel_from_the_centres(
     assert np.allclose(distance[20, 10:30], np.arange(10, 30) + 0.5 - 20, atol=0.02)
 
 
+def test_cameras_that_stand_beside_the_object_have_a_hull() -> None:
+    """Corners of the grid lie behind them."""
+    made = []
+    for k, direction in enumerate(normalise(np.random.default_rng(1).normal(size=(8, 3)))):
+        camera = camera_at(direction, 96, 1.3 * RADIUS)
+        wide = replace(camera, K=np.array([[20.0, 0, 48], [0, 20.0, 48], [0, 0, 1]]))
+        ball = Surface(make_sphere(4).reconstruction.surface.vertices, make_sphere(4).reconstruction.surface.faces)
+        mask = (camera_hits(RayCaster(ball), wide, np.indices((96, 96)).reshape(2, -1).T).face >= 0).reshape(96, 96)
+        made.append(View(f"view_{k + 1:02d}", wide, mask, np.zeros((int(mask.sum()), 1, 3), np.uint16), 1.0, 65535, (1,)))
+    capture = Capture("near", tuple(made))
+    grid = signed_distance(capture, 32)
+    assert np.isfinite(grid.values).all()
+    hull = hull_of_masks(capture, grid)
+    assert np.linalg.norm(hull.vertices, axis=1).min() > 0.9 * RADIUS
+
+
 def test_one_view_bounds_nothing() -> None:
     with pytest.raises(CaptureError, match="leave the object unbounded"):
         masks_box(discs(1))

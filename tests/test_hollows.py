@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,9 +12,10 @@ from sphere_scene import RADIUS, make_sphere
 
 import mvps.digging
 from mvps.coarse import begin, tells_of_hollows
-from mvps.digging import MOST_TURNS, hollowed, pitted, while_it_helps
+from mvps.digging import MOST_TURNS, _judge, hollowed, pitted, while_it_helps
 from mvps.hollows import WALL_CELLS, beyond_noise, clearance, dug, hidden, in_walls, mean_depth, misfit, pits, solid, thickness
 from mvps.hull import visual_hull
+from mvps.joint.refine import Refined
 from mvps.mesh import vertex_areas, vertex_normals
 from mvps.passes import stage_two
 from mvps.plan import Parts, carving_pass
@@ -320,3 +321,13 @@ def test_a_vessel_is_hollow() -> None:
     # Of 82: -4 on the bridge, 63 measured (52 where Stage I had the last word). Two pits, one into the other.
     assert before < 0.1 * true < 0.7 * true < after < 1.05 * true and len(rounds) >= 2
     assert np.nanmean(found.unexplained) < 0.6 * np.nanmean(bridged.unexplained)
+
+
+def test_a_pit_that_takes_away_what_masks_hold_leaves_all() -> None:
+    """Half of a ball fits as well as the whole."""
+    scene = make_sphere(4)
+    ball = scene.reconstruction.surface
+    half = Surface(ball.vertices, ball.faces[(ball.vertices[ball.faces][..., 2] > 0).all(1)])
+    whole, less = (SimpleNamespace(surface=surface, unexplained=np.full(len(surface.vertices), 0.1)) for surface in (ball, half))
+    left = _judge(scene.capture, cast(Refined, whole), 0.0)
+    assert left(cast(Refined, whole)) == pytest.approx(0.01) and left(cast(Refined, less)) == 1

@@ -201,6 +201,8 @@ def test_cameras_side_by_side_are_no_twins_however_far_from_the_origin(sound: Ca
     def from_afar(view: View) -> View:
         return view.taken_by(replace(view.camera, translation=view.camera.translation - view.camera.rotation @ np.full(3, away * size)))
 
-    there = place + away * size
-    assert not mvps.checks.silhouettes._twins([from_afar(first), from_afar(moved)], there)
-    assert mvps.checks.silhouettes._twins([from_afar(first), from_afar(replace(moved, camera=camera))], there)
+    where = place + away * size, size
+    assert not mvps.checks.silhouettes._twins([from_afar(first), from_afar(moved)], *where)
+    assert mvps.checks.silhouettes._twins([from_afar(first), from_afar(replace(moved, camera=camera))], *where)
+    nearer = replace(moved, camera=replace(camera, K=camera.K * [[1.5, 1, 1], [1, 1.5, 1], [1, 1, 1]]))
+    assert not mvps.checks.silhouettes._twins([from_afar(first), from_afar(nearer)], *where), "two zooms from one place"

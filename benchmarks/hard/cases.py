@@ -23,13 +23,13 @@ from mvps.synthetic.settings import SceneSettings
 
 
 class Sample(NamedTuple):
-    """The capture that the program is given, the good one, and the good one's truth; behind: what photographs of a good view show
-    behind the object, (lights, 3), where that is not black."""
+    """The capture that the program is given, the good one, and the good one's truth; behind: what some pixels (n,) of a good view's k-th
+    photograph show behind the object, (n, 3), where that is not black."""
 
     given: Capture
     good: Capture
     truth: Truth
-    behind: Callable[[View], NDArray[np.uint16]] | None = None
+    behind: Callable[[View, int, int], NDArray[np.uint16]] | None = None
 
 
 class Case(NamedTuple):
@@ -64,12 +64,18 @@ def damaged(by: Damage, amount: float, settings: SceneSettings = BASE) -> Sample
 
 def bright(px: float) -> Sample:
     """The base in front of a bright wall, with masks that reach this much too far."""
-    return damaged(damage.before_bright, px)._replace(behind=damage.background)
+    return damaged(damage.before_bright, px)._replace(behind=lambda view, k, n: np.broadcast_to(damage.background(view)[k], (n, 3)))
 
 
 def with_black_level(share: float) -> Sample:
-    """The base by a camera whose black level, this share of full scale, was left in."""
-    return damaged(damage.black_level, share)._replace(behind=lambda view: np.full((len(view.lights), 3), round(share * WHITE), np.uint16))
+    """The base by a camera whose black level, this share of full scale, was left in, with the object's noise around it."""
+    rng = np.random.default_rng(0)
+
+    def behind(view: View, k: int, n: int) -> NDArray[np.uint16]:
+        level: NDArray[np.uint16] = np.rint(WHITE * (share + rng.normal(0, BASE.noise, (n, 3)))).clip(0).astype(np.uint16)
+        return level
+
+    return damaged(damage.black_level, share)._replace(behind=behind)
 
 
 def _number(value: float) -> str:

@@ -9,6 +9,7 @@ view's photographs, and v_j the mean of photograph j over Z, b is the least v_j 
                                     without a black level from one to twenty-fold and more (docs/findings/checks.md);
     b - 3 sigma <= DARKEST quantile of the object's samples: what was cut out and laid on grey is darker itself somewhere;
     3 sigma < b: black levels are there for noise to have room below; cut off at black, noise alone is 0.4 to 0.8 sigma in the mean;
+    sixteen bits are not all the same over Z: no camera is so free of noise, but what was painted is;
     b > LEAST of the bright level.
 
 sigma is half of what lies between the quantiles of 16 and 84 % of a photograph's values over Z, of one channel.
@@ -50,6 +51,9 @@ NOISE = 3.0
 DARKEST = 1e-3
 """Of the object's samples; their least would be chosen by noise."""
 
+BITS_8 = 1 / 255
+"""Scale of photographs of eight bits, whose steps may hide noise."""
+
 PIXELS = 2000
 """Of an object that are looked at, or more."""
 
@@ -58,10 +62,11 @@ LEAST = 2e-3
 
 
 class _Dark(NamedTuple):
-    """What a view's photographs show where they are darkest: v_j (photographs, 3) and sigma, radiance."""
+    """What a view's photographs show where they are darkest: v_j (photographs, 3) and sigma, radiance; whether it was painted."""
 
     level: Float
     sigma: float
+    painted: bool
 
 
 def black_level(capture: Capture) -> tuple[Capture, list[Finding]]:
@@ -73,7 +78,7 @@ def black_level(capture: Capture) -> tuple[Capture, list[Finding]]:
     if any(np.quantile(_frame(view), DARK) * view.scale <= LEAST * bright for view, (bright, _) in zip(chosen, objects, strict=True)):
         return capture, []
     found = [one for one in on_cores(_dark, chosen) if one is not None]
-    if not found:
+    if not found or any(one.painted for one in found):
         return capture, []
     level = np.concatenate([one.level for one in found])
     b, grey = level.min(0), level.mean(1)
@@ -112,7 +117,8 @@ def _dark(view: View) -> _Dark | None:
     some = np.unique(np.linspace(0, len(view.files) - 1, min(PHOTOGRAPHS, len(view.files))).astype(int))
     values = [decode(view.files[k], read_header(view.files[k]))[dark] * view.scale for k in some]
     low, high = np.quantile(values, (0.16, 0.84), axis=1)
-    return _Dark(np.array([one.mean(0) for one in values]), float(np.median(high - low)) / 2)
+    painted = view.scale < BITS_8 and bool((np.ptp(values, axis=(0, 1)) == 0).all())
+    return _Dark(np.array([one.mean(0) for one in values]), float(np.median(high - low)) / 2, painted)
 
 
 def _without(view: View, b: Float) -> View:

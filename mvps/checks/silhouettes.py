@@ -15,10 +15,12 @@ Photographs speak of masks only where they tell object from background; silhouet
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import binary_opening, binary_propagation
 
+from mvps.camera import project
 from mvps.checks.coherence import Coherence
 from mvps.checks.cones import ENOUGH, Cones, wrong_at_most
 from mvps.checks.lit import BLOCK, Lit, lit_part, missing_parts, moved, steps, stray_parts
@@ -159,7 +161,7 @@ def _left_out(cones: Cones) -> tuple[Capture, list[Finding]]:
         )
         findings.append(Finding("pose", names[among.pop(best)], text, True))
         counts = left[best]
-    for pair in _twins([capture.views[at] for at in among], object_place(capture)[0]):
+    for pair in _twins([capture.views[at] for at in among], *object_place(capture)):
         both = [names.index(view.name) for view in pair]
         if not {*both} <= {*among}:
             continue
@@ -204,16 +206,14 @@ def _wrong(cones: Cones, among: Sequence[int], suspects: Sequence[int]) -> int |
     return best if misfit(misses[best]) <= DOUBTFUL_PIXELS and fall > CERTAIN * error else None
 
 
-def _twins(views: Sequence[View], place: Float) -> list[tuple[View, View]]:
-    """Pairs of views whose cameras are the same to a pixel at the object's place (3,) and whose masks differ by more than their outlines'
-    staircase."""
-    pairs = []
+def _twins(views: Sequence[View], place: Float, size: float) -> list[tuple[View, View]]:
+    """Pairs of views whose cameras show a cube of the object's place (3,) and size at the same pixels, and whose masks differ by more than
+    their outlines' staircase."""
+    pairs, cube = [], place + size / 2 * np.array(list(product((-1, 1), repeat=3)))
+    shown = {view.name: project(view.camera, cube)[0] for view in views}
     for at, one in enumerate(views):
         for other in views[at + 1 :]:
-            a, b = one.camera, other.camera
-            first, second = (camera.rotation @ place + camera.translation for camera in (a, b))
-            depth = max(float(np.linalg.norm(first)), np.finfo(float).tiny)
-            moved = max(np.abs(first - second).max(), depth * np.abs(a.rotation - b.rotation).max()) * a.focal_length / depth
+            moved = np.abs(shown[one.name] - shown[other.name]).max()
             if moved < 1 and one.mask.shape == other.mask.shape and binary_opening(one.mask ^ other.mask, BLOCK).sum() > ENOUGH:
                 pairs.append((one, other))
     return pairs
