@@ -4,10 +4,10 @@ With the seen vertices fixed, the others minimise
 
     sum over them and their neighbours of |y_i - mean of y_i's neighbours|^2  +  sum over u of tau |y_u - t_u|^2
 
-a discrete thin plate (Botsch and Kobbelt 2004) that leaves the rim with the slope that it has there; pieces that no view
-sees stay. Nothing of an object projects outside
-a mask, nor lies in front of what a view sees: a vertex u that does is drawn to t_u, where it comes back into the mask that it is farthest
-out of, or a pixel behind the seen surface; a few passes find them all. The faces stay, so that a closed surface stays closed.
+a discrete thin plate (Botsch and Kobbelt 2004) that leaves the rim with the slope that it has there; pieces that no view sees stay. Nothing
+of an object projects outside a mask, nor lies in front of what a view sees: a vertex u that does is drawn to t_u, where it comes back into
+the mask that it is farthest out of, or a pixel behind the seen surface; a few passes find them all. The faces stay, so that a closed
+surface stays closed.
 """
 
 from __future__ import annotations
