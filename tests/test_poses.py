@@ -12,10 +12,11 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
+from sphere_scene import RADIUS, make_sphere
 
 import mvps.checks.poses
 from mvps.camera import project
-from mvps.checks.coherence import coherence, jacobian
+from mvps.checks.coherence import coherence, jacobian, outline_points
 from mvps.checks.outlines import Motions, Unknowns, after, by_other_half, outlines_of
 from mvps.checks.photographed import confirmed
 from mvps.checks.poses import by_silhouettes, poses
@@ -26,6 +27,7 @@ from mvps.joint.bundle import Model, aligned
 from mvps.mesh import isotropic_remesh, vertex_normals
 from mvps.motions import UNKNOWNS, Object, derivatives, gauge, image_derivatives, moved, with_motions, without_gauge
 from mvps.scene import Capture, Float, Law, View
+from mvps.silhouette import mask_distances
 from mvps.synthetic.scene import Scene, make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
 
@@ -238,3 +240,14 @@ def test_photographs_undo_what_silhouettes_leave(scene: Scene, clean: Capture) -
     lights = replace(scene.lights, one_rig=False)
     motions, _ = aligned(with_motions(clean, body, error), lights, model, body)
     assert left(clean, body, error + motions) < 0.35 * left(clean, body, error)
+
+
+def test_a_cut_view_says_nothing_of_what_lies_beside_its_image() -> None:
+    """Lines of sight along the outline that pass there meet the object all the same."""
+    whole, other = make_sphere(3).capture.views[:2]
+    width = other.camera.width // 5
+    camera = replace(other.camera, width=width)
+    cut = View(other.name, camera, other.mask[:, :width], np.zeros((int(other.mask[:, :width].sum()), 1, 3), np.uint16), 1.0, 1, (1,))
+    fields = mask_distances(Capture("cut", (whole, cut)))
+    found = coherence((whole.camera, camera), fields, Object(np.zeros(3), 1.5 * RADIUS), 0, outline_points(fields[0], 2.0))
+    assert len(found.miss) > 50 and found.miss.max() < 0.5

@@ -17,7 +17,7 @@ from mvps.load import read_capture
 from mvps.own_units import object_place
 from mvps.scene import Bool, Camera, Capture, View
 from mvps.synthetic.files import write_capture
-from mvps.synthetic.scene import render_capture
+from mvps.synthetic.scene import make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
 
 VIEWS, THIRD = 8, "view_03"
@@ -206,3 +206,15 @@ def test_cameras_side_by_side_are_no_twins_however_far_from_the_origin(sound: Ca
     assert mvps.checks.silhouettes._twins([from_afar(first), from_afar(replace(moved, camera=camera))], *where)
     nearer = replace(moved, camera=replace(camera, K=camera.K * [[1.5, 1, 1], [1, 1.5, 1], [1, 1, 1]]))
     assert not mvps.checks.silhouettes._twins([from_afar(first), from_afar(nearer)], *where), "two zooms from one place"
+
+
+def test_close_ups_may_be_in_the_majority() -> None:
+    """Six of nine views show the head alone, four times as large: their masks' middles are not the object's."""
+    settings = SceneSettings(views=9, lights=2, size=96)
+    scene = make_scene(settings)
+    larger = [camera.K * [[4, 1, 1], [1, 4, 1], [1, 1, 1]] + [[0, 0, 0], [0, 0, 112], [0, 0, 0]] for camera in scene.cameras]
+    cameras = tuple(replace(camera, K=K) if i % 3 else camera for i, (camera, K) in enumerate(zip(scene.cameras, larger, strict=True)))
+    capture = render_capture(settings, replace(scene, cameras=cameras))[0]
+    assert sum(view.mask[-1].any() for view in capture.views) == 6
+    after, found = silhouettes(capture)
+    assert not found and all(a is b for a, b in zip(after.views, capture.views, strict=True))

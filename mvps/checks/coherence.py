@@ -74,7 +74,11 @@ def _along(cameras: Sequence[Camera], fields: Fields, own: int, origins: Float, 
         start = (origins @ camera.rotation.T + camera.translation) @ camera.K.T
         slope = directions @ camera.rotation.T @ camera.K.T
         x, y, depth = (start[:, k, None] + t * slope[:, k, None] for k in range(3))
-        m = sampled_at(field, (x / depth).ravel(), (y / depth).ravel()).reshape(t.shape)
+        x, y = x / depth, y / depth
+        m = sampled_at(field, x.ravel(), y.ravel()).reshape(t.shape)
+        if min(edge.min() for edge in (field[0], field[-1], field[:, 0], field[:, -1])) < 0:
+            # What the image cuts off may go on beside it, as deep inside as anything.
+            m[(x < 0) | (y < 0) | (x > camera.width) | (y > camera.height)] = field.min()
         above = m > largest
         np.copyto(largest, m, where=above)
         np.copyto(whose, j, where=above)

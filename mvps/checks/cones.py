@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvps.camera import footprint, inside_image, project, rays
+from mvps.hull import encloses
 from mvps.mesh import lengths
 from mvps.motions import Object
 from mvps.scene import Bool, Camera, Capture, Float
@@ -43,7 +44,11 @@ def wrong_at_most(views: int) -> int:
 
 
 def _around(capture: Capture) -> tuple[Float, float]:
-    """A point (3,) near the object and a radius that holds it, world, whatever a few wrong views say."""
+    """A point (3,) near the object and a radius that holds it, world, whatever a few wrong views say. Middles and extents of masks that the
+    frame cuts off are not the object's: they do not count where the others enclose it by themselves."""
+    whole = tuple(view for view in capture.views if not _cut_off(view.mask))
+    if 0 < len(whole) < len(capture.views) and encloses(Capture(capture.name, whole)):
+        capture = Capture(capture.name, whole)
     start, toward, pixels = [], [], []
     for view in capture.views:
         middle = view.pixels.mean(0)
