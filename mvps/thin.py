@@ -30,7 +30,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, label
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from mvps.camera import pixel_footprint, project
+from mvps.camera import project
 from mvps.cores import neighbours, on_cores
 from mvps.finding import Finding
 from mvps.hull import hull_grid, hull_of_masks
@@ -49,10 +49,10 @@ BEYOND = 2.0
 """Pixels from what a surface covers, from which pixels of a mask are bare: less is an error of its outline, whose cells are two pixels."""
 
 FINER = 4
-"""Cells of the fine grid to two pixels: half a pixel each."""
+"""Cells of the fine grid to one of the hull's: half a pixel each, more where the hull's are of more than two (hull.py)."""
 
 MOST_NODES = 1 << 25
-"""Of a fine grid, 0.2 GB; half as fine, and so on, where a piece's would have more."""
+"""Of a fine grid, 0.2 GB; half as fine where a piece's would have more."""
 
 SLACK = 0.15
 """Pixels by which T may lie outside of a mask: half of what its border errs by. Between pixels that touch at corners alone, as those of a
@@ -272,12 +272,7 @@ def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> li
     where = np.argwhere(nodes)
     low, high = where.min(0), where.max(0) + 1
     cells = np.pad(nodes[tuple(map(slice, low, high))], 1)
-    # The hull's cells are of two pixels, or of more where the object is many pixels across.
-    middle = hull.origin + hull.spacing * (low + high) / 2
-    wide = max(1, round(hull.spacing / (2 * pixel_footprint([of.view.camera for of in views], middle))))
-    finer = FINER * wide
-    while finer > FINER // 2 and cells.size * finer**3 > MOST_NODES:
-        finer //= 2
+    finer = FINER if cells.size * FINER**3 <= MOST_NODES else FINER // 2
     spacing, fine = hull.spacing / finer, np.argwhere(cells.repeat(finer, 0).repeat(finer, 1).repeat(finer, 2))
     # A node of the coarse grid stands in the middle of finer^3 of the fine one.
     origin = hull.origin + hull.spacing * (low - 1.5) + spacing / 2
@@ -286,7 +281,7 @@ def _pieces(views: Sequence[_Bare], hull: SignedDistanceGrid, nodes: Bool) -> li
     inside[tuple(fine[(outside < 0) & (near >= 2)].T)] = True
     if not inside.any():
         return []
-    reached = binary_dilation(inside, AROUND, iterations=round(ROOT * finer / (2 * wide)))[tuple(fine.T)]
+    reached = binary_dilation(inside, AROUND, iterations=round(ROOT * finer / 2))[tuple(fine.T)]
     values = np.full(inside.shape, spacing, np.float32)
     values[tuple(fine.T)] = np.where(reached, np.minimum(outside, spacing), spacing)
     vertices, faces, _, _ = marching_cubes(values, 0.0)

@@ -13,12 +13,12 @@ import trimesh
 from mvps.camera import surface_pixel
 from mvps.hull import hull_grid, hull_of_masks
 from mvps.joint.refine import Refined
-from mvps.mesh import mean_edge_length, normalise, vertex_normals
+from mvps.mesh import normalise, vertex_normals
 from mvps.progress import Progress
-from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, SignedDistanceGrid, Surface, View
+from mvps.scene import Capture, Float, Law, Lights, Material, NormalMap, Surface, View
 from mvps.synthetic.scene import make_cameras
 from mvps.synthetic.settings import SceneSettings
-from mvps.thin import _Bare, _found, _needed, _Piece, _pieces, _where, joined, with_thin_parts, without_thin_parts
+from mvps.thin import _Bare, _found, _needed, _Piece, joined, with_thin_parts, without_thin_parts
 from mvps.visibility import RayCaster, camera_hits
 
 SETTINGS = SceneSettings(views=8, size=96, extent=2.0)
@@ -182,16 +182,3 @@ def test_a_ghost_that_no_second_view_asks_for_ends_no_search() -> None:
     ghost = covering(range(45, 105), range(20), nothing)
     for given in ([one, two], [one, two, ghost], [ghost, two, one]):
         assert [id(piece) for piece in _needed([bare(200)] * 3, given)] == [id(one), id(two)]
-
-
-def test_grids_of_large_photographs_are_as_fine() -> None:
-    """Where the hull's cells are of many pixels rods of two are found all the same."""
-    large = photographed([ball(), *rods(2.0)])
-    grid = hull_grid(large)
-    for coarser in (1, 3):
-        wide = SignedDistanceGrid(grid.values[::coarser, ::coarser, ::coarser], grid.origin, grid.spacing * coarser)
-        surface = hull_of_masks(large, grid)
-        views = _found(large, surface)[0]
-        found = [piece for nodes in _where(views, wide) for piece in _pieces(views, wide, nodes)]
-        edge = np.mean([mean_edge_length(piece.surface) for piece in found])
-        assert len(found) > 1 and edge < 1.5 * PIXEL
