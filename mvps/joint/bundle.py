@@ -28,7 +28,7 @@ from mvps.joint.photometry import WEAK_TIE
 from mvps.joint.steps import CORRELATED, free_reflectance, vertex_steps
 from mvps.mesh import vertex_normals
 from mvps.motions import UNKNOWNS, Object, derivatives, gauge, image_derivatives, with_motions, without_gauge
-from mvps.scene import Bool, Capture, Float, Law, Lights, Surface, View
+from mvps.scene import Bool, Capture, Float, Int, Law, Lights, Surface, View
 
 VERTEX_STEPS, CAMERA_STEPS = 2, 4
 """Steps of the vertices before each step of the cameras, and steps of the cameras: each leaves less than half of the last one's."""
@@ -150,8 +150,8 @@ def solved(capture: Capture, lights: Lights, model: Model) -> tuple[list[ViewSam
     return views, replace(model, vertices=vertices)
 
 
-def aligned(capture: Capture, lights: Lights, model: Model, body: Object) -> tuple[Float, Model]:
-    """Motions (views, 6) of the cameras, each unknown within +-REACH_PIXELS, by which these photographs agree best, and the model then."""
+def aligned(capture: Capture, lights: Lights, model: Model, body: Object) -> Float:
+    """Motions (views, 6) of the cameras, each unknown within +-REACH_PIXELS, by which these photographs agree best."""
     motions = np.zeros((len(capture.views), UNKNOWNS))
     for _ in range(CAMERA_STEPS):
         at = with_motions(capture, body, motions)
@@ -160,11 +160,12 @@ def aligned(capture: Capture, lights: Lights, model: Model, body: Object) -> tup
         step = without_gauge(step, gauge([view.camera for view in at.views], body))
         motions = np.clip(motions + step, -REACH_PIXELS, REACH_PIXELS)
         model = replace(model, surface=_spread(model, offsets))
-    return motions, solved(with_motions(capture, body, motions), lights, model)[1]
+    return motions
 
 
-def prediction_errors(capture: Capture, lights: Lights, model: Model) -> Float:
-    """(V,) mean absolute error of these photographs' samples over their mean value, NaN for a vertex without any."""
+def prediction_errors(capture: Capture, lights: Lights, model: Model, part_of: Int) -> Float:
+    """(parts,) mean absolute error of these photographs' samples over their mean value, NaN for a part without any; part_of (V,): of the
+    vertices."""
     views = observe(capture, model.surface, lights, model.vertices.normal.device, model.among, model.law.shadows)
     error, level = torch.zeros_like(model.vertices.scale), torch.zeros_like(model.vertices.scale)
     for samples, grey in zip(views, grey_lights(lights, error.device), strict=True):
@@ -172,5 +173,5 @@ def prediction_errors(capture: Capture, lights: Lights, model: Model) -> Float:
         shaded = evaluate(model.vertices.normal[index], model.vertices.reflectance[index], samples.towards, grey, model.law)
         error.index_add_(0, index, (weight * (shaded.predicted - samples.image).abs()).sum(1))
         level.index_add_(0, index, (weight * samples.image).sum(1))
-    ratio: Float = (error / level).double().cpu().numpy()
-    return np.where(level.cpu().numpy() > 0, ratio, np.nan)
+    errors, levels = (np.bincount(part_of, of.double().cpu().numpy()) for of in (error, level))
+    return np.where(levels > 0, errors / np.maximum(levels, np.finfo(float).tiny), np.nan)
