@@ -9,13 +9,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from scipy.ndimage import binary_dilation, binary_erosion
 
 import mvps.checks.silhouettes
 from mvps.checks.silhouettes import silhouettes
 from mvps.load import read_capture
 from mvps.own_units import object_place
-from mvps.scene import Bool, Camera, Capture, View
+from mvps.scene import Bool, Camera, Capture, Material, Surface, View
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import make_scene, render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -34,6 +35,28 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def sound(folder: Path) -> Capture:
     return read_capture(folder)
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
+    """The object on a lit column, which no mask holds."""
+    settings = SceneSettings(views=VIEWS, lights=4, size=96)
+    scene = make_scene(settings)
+    cameras = tuple(replace(camera, K=camera.K * [[0.8, 1, 1], [1, 0.8, 1], [1, 1, 1]]) for camera in scene.cameras)
+    column = trimesh.creation.cylinder(12, segment=((0, 0, scene.surface.vertices[:, 2].min() + 3), (0, 0, -110)), sections=48)
+    rows = np.append(np.arange(len(scene.surface.vertices)), np.zeros(len(column.vertices), int))
+    grey, normal = scene.material.albedo[rows], np.concatenate([scene.material.normal, column.vertex_normals])
+    both = Surface(
+        np.concatenate([scene.surface.vertices, column.vertices]),
+        np.concatenate([scene.surface.faces, len(scene.surface.vertices) + column.faces]),
+    )
+    of_both = Material(normal, grey, scene.material.specular_weight[rows], scene.material.sharpness, scene.material.confidence[rows])
+    alone = render_capture(settings, replace(scene, cameras=cameras))[0]
+    place = tmp_path_factory.mktemp("standing") / "capture"
+    write_capture(*render_capture(settings, replace(scene, cameras=cameras, surface=both, material=of_both)), place)
+    for view in alone.views:
+        cv2.imwrite(str(place / view.name / "mask.png"), view.mask.astype(np.uint8) * 255)
+    return place, read_capture(place)
 
 
 def with_masks(folder: Path, sound: Capture, edit: Callable[[Bool], Bool], only: str = "") -> Capture:
@@ -65,6 +88,12 @@ def without_limb(mask: Bool) -> Bool:
     cut = mask.copy()
     cut[tuple(pixels[along > np.quantile(along, 0.9)].T)] = False
     return cut
+
+
+def headless(mask: Bool) -> Bool:
+    """Without its upper fifth."""
+    rows = np.flatnonzero(mask.any(1))
+    return mask & (np.arange(len(mask)) > rows[0] + 0.2 * np.ptp(rows))[:, None]
 
 
 def with_holes(mask: Bool) -> Bool:
@@ -110,6 +139,40 @@ def test_parts_of_masks_are_mended(folder: Path, sound: Capture, edit: Callable[
     for view, true in zip(mended.views, sound.views, strict=True):
         both = view.mask & true.mask
         np.testing.assert_array_equal(view.samples[both[view.mask]], true.samples[both[true.mask]])
+
+
+def test_a_lit_stand_that_no_mask_holds_stays_out(standing: tuple[Path, Capture]) -> None:
+    left, findings = silhouettes(standing[1])
+    assert left is standing[1] and not findings
+
+
+def test_a_limb_is_given_back_beside_a_lit_stand(standing: tuple[Path, Capture]) -> None:
+    bad = with_masks(*standing, headless, THIRD)
+    mended, findings = silhouettes(bad)
+    assert wrong(mended, standing[1]) <= 0.05 * wrong(bad, standing[1])
+    assert [(one.about, one.where, one.mended) for one in findings] == [("mask", THIRD, True)]
+
+
+def test_a_limb_that_two_of_ten_masks_lack_is_given_back(tmp_path: Path) -> None:
+    """Each leaves no room for what the other lacks; all other masks show it."""
+    place = tmp_path / "capture"
+    write_capture(*render_capture(SceneSettings(views=10, lights=4, size=96)), place)
+    whole = read_capture(place)
+
+    for view in whole.views:
+        mask = headless(view.mask) if view.name in (THIRD, "view_06") else view.mask
+        cv2.imwrite(str(place / view.name / "mask.png"), mask.astype(np.uint8) * 255)
+    bad = read_capture(place)
+    assert wrong(silhouettes(bad)[0], whole) <= 0.05 * wrong(bad, whole)
+
+
+def test_what_masks_lack_is_given_back_after_a_wrong_view_is_left_out(folder: Path, sound: Capture) -> None:
+    bad = with_masks(folder, sound, without_limb, THIRD)
+    views = [posed(view, sound.views[1]) if view.name == "view_06" else view for view in bad.views]
+    left, _ = silhouettes(Capture("two faults", tuple(views)))
+    assert "view_06" not in {view.name for view in left.views}
+    third = next(view for view in left.views if view.name == THIRD)
+    assert (third.mask ^ sound.views[2].mask).sum() <= 0.05 * (bad.views[2].mask ^ sound.views[2].mask).sum()
 
 
 def posed(view: View, like: View) -> View:

@@ -13,6 +13,7 @@ refined may move a silhouette, or a cell's width where that is more.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 
 import cv2
 import numpy as np
@@ -132,6 +133,13 @@ class Cones:
         # A pixel beside the slack: neighbouring points fall on the image a cell apart.
         near: Bool = cv2.distanceTransform(picture, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= self._slack[view] + 1
         return near
+
+    def with_parts(self, parts: Sequence[Bool]) -> Cones:
+        """The cones of masks that have these parts (height, width) of every view besides; pixels to be covered stay the masks' own."""
+        shown = [np.append(part.ravel(), False)[at] for part, at in zip(parts, self._at, strict=True)]
+        other = copy(self)
+        other.out = self.out & ~np.array(shown)
+        return other
 
     def uncovered(self, among: Sequence[int]) -> list[int]:
         """Pixels of each mask of the views `among` that the hull of the others among them does not cover."""

@@ -5,7 +5,8 @@ In this order, each mended before the next is looked at:
 mask    grown or shrunk as a whole: the edge of what the photographs show lit is not where the mask ends (lit.py)
 point   silhouettes that disagree, and one shift of all principal points explains it (principal.py): moved
 part    dark under all lights, at the mask's rim, and outside the hull of the other views or apart from the rest: taken out; lit, outside
-        the mask or in a hole of it, and inside the hull of the other views: given back. A hole that shows the background stays
+        the mask or in a hole of it, where the other views leave room for it or show it: given back. A hole that shows the background,
+        and what stands beside the object in all views, stay out
 view    silhouettes that disagree (cones.py): where all others agree without a view, and without no other, that view's pose is not that of
         its photographs, and it is left out; so are two views of one pose and two silhouettes where nothing says which is wrong
 
@@ -21,7 +22,7 @@ import numpy as np
 from scipy.ndimage import binary_opening, binary_propagation
 
 from mvps.camera import project
-from mvps.checks.coherence import Coherence
+from mvps.checks.coherence import Coherence, coherence
 from mvps.checks.cones import ENOUGH, Cones, wrong_at_most
 from mvps.checks.lit import BLOCK, Lit, lit_part, missing_parts, moved, steps, stray_parts
 from mvps.checks.outlines import DOUBTFUL_PIXELS, fallen, misfit, outlines_of
@@ -32,9 +33,13 @@ from mvps.load import with_mask
 from mvps.material import CERTAIN
 from mvps.own_units import object_place
 from mvps.scene import Bool, Capture, Float, View
+from mvps.silhouette import mask_distances
 
 FEWEST = 3
 """Views that can contradict one another: of two, either may be wrong."""
+
+LINES = 400
+"""Of sight through a part, at most: the share of them that meet something is known to a fortieth."""
 
 
 def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
@@ -50,6 +55,11 @@ def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
         findings = [*findings, *of_point]
     mended, of_parts = _parted(cones, shown)
     left, of_views = _left_out(Cones(mended) if of_parts else cones)
+    if len(left.views) < len(mended.views):
+        # A wrong view hides what other masks lack.
+        kept = {view.name for view in left.views}
+        left, of_more = _parted(Cones(left), [found for found, view in zip(shown, mended.views, strict=True) if view.name in kept])
+        of_views = [*of_views, *of_more]
     return left, [*findings, *of_parts, *of_views]
 
 
@@ -94,12 +104,12 @@ def _parted(cones: Cones, shown: list[Lit | None]) -> tuple[Capture, list[Findin
     parts = on_cores(parts_of, capture.views, shown)
     if not any(stray or missing for stray, missing in parts):
         return capture, []
-    views = list(capture.views)
+    views, lacking = list(capture.views), _lacking(cones, [missing for _, missing in parts])
     gone, back = dict[str, int](), dict[str, int]()
-    for at, (stray, missing) in enumerate(parts):
+    for at, (stray, _) in enumerate(parts):
         view = views[at]
         out = _sum([part for part in stray if _needless(cones, at, part)], view.mask)
-        added = _sum([part for part in missing if _wanted(cones, at, part)], view.mask)
+        added = _sum(lacking[at], view.mask)
         gone |= {view.name: int(out.sum())} if out.any() else {}
         back |= {view.name: int(added.sum())} if added.any() else {}
         if out.any() or added.any():
@@ -119,11 +129,41 @@ def _sum(parts: Sequence[Bool], like: Bool) -> Bool:
     return np.asarray(np.logical_or.reduce([np.zeros_like(like), *parts]))
 
 
-def _wanted(cones: Cones, view: int, part: Bool) -> bool:
-    """Whether the hull of the other views, but for those that may be wrong, covers most of a part."""
-    everyone = range(len(cones.capture.views))
-    covered = cones.covered(view, everyone, dissent=wrong_at_most(len(everyone)) - 1)
-    return bool(covered[part].mean() > 0.5)
+def _lacking(cones: Cones, missing: Sequence[Sequence[Bool]]) -> list[list[Bool]]:
+    """Of lit parts (height, width) beside every view's mask those that are the object's. The hull of the other views, but for those that
+    may be wrong, covers most of each with its slack. But slack covers what stands beside the object as well, a stand or light on a wall
+    that all masks leave out. So the others have to leave room for it without slack, or to show it: have pixels that nothing else covers."""
+    views = cones.capture.views
+    everyone, dissent = range(len(views)), wrong_at_most(len(views)) - 1
+    within = [[part for part in of_view if cones.covered(at, everyone, dissent)[part].mean() > 0.5] for at, of_view in enumerate(missing)]
+    if not any(within):
+        return within
+    disagree = any(cones.uncovered(everyone))
+    return [
+        [part for part in of_view if _has_room(cones, at, part) or (disagree and _is_shown(cones, at, part, within))]
+        for at, of_view in enumerate(within)
+    ]
+
+
+def _has_room(cones: Cones, view: int, part: Bool) -> bool:
+    """Whether most lines of sight through a part meet what the other views leave of the object, as those along outlines do."""
+    body = cones.body()
+    if body is None:
+        return False
+    pixels = np.argwhere(part)
+    some = pixels[:: -(-len(pixels) // LINES)]
+    capture = cones.capture
+    found = coherence([one.camera for one in capture.views], mask_distances(capture), body, view, some[:, ::-1] + 0.5)
+    return bool(np.median(found.miss) <= DOUBTFUL_PIXELS)
+
+
+def _is_shown(cones: Cones, view: int, part: Bool, parts: Sequence[Sequence[Bool]]) -> bool:
+    """Whether other masks have a block of pixels that nothing covers if all of these parts of all views are the object's but this one."""
+    masks, everyone = [one.mask for one in cones.capture.views], range(len(parts))
+    whole = [_sum(of_view, mask) for of_view, mask in zip(parts, masks, strict=True)]
+    without = [of_view & ~part if at == view else of_view for at, of_view in enumerate(whole)]
+    more, less = (sum(cones.with_parts(given).uncovered(everyone)) for given in (without, whole))
+    return more - less >= BLOCK.size
 
 
 def _needless(cones: Cones, view: int, part: Bool) -> bool:
