@@ -58,12 +58,38 @@ def test_a_mask_is_moved_to_where_the_object_ends(pixels: int) -> None:
         assert left < 0.15 * (view.mask ^ disc(25)).sum() + 12
 
 
-@pytest.mark.parametrize("sigma", [0.5, 1.0])
-def test_a_blurred_edge_is_no_shrunk_mask(sigma: float) -> None:
-    view = photographed(disc(25))
+def out_of_focus(view: View, sigma: float) -> View:
     blurred = gaussian_filter(view.frame, sigma)
-    soft = View("ball", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), blurred)
-    assert seen(soft).judged and not seen(soft).off
+    return View("ball", CAMERA, view.mask, view.samples, view.scale, view.saturation, (), blurred)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 1.5, 2.0])
+def test_a_blurred_edge_is_no_shrunk_mask(sigma: float) -> None:
+    soft = out_of_focus(photographed(disc(25)), sigma)
+    found = seen(soft)
+    assert found.judged and (found.beyond > 1) == (sigma > 1)
+    found = found.blurred() if sigma > 1 else found
+    assert not found.off
+    assert not missing_parts(soft.mask, found), "what a lens lights beside the mask"
+
+
+@pytest.mark.parametrize("pixels", [-6, -3, -1, 0, 1, 3, 6])
+def test_no_mask_makes_sharp_photographs_look_blurred(pixels: int) -> None:
+    assert seen(photographed(disc(25 + pixels))).beyond < 1
+
+
+@pytest.mark.parametrize("sigma", [1.5, 2.0])
+def test_a_shrunk_mask_is_found_where_photographs_are_blurred(sigma: float) -> None:
+    soft = out_of_focus(photographed(disc(22)), sigma)
+    found = seen(soft).blurred()
+    assert found.off
+    assert (moved(soft, steps(soft.mask), found) ^ disc(25)).sum() < 0.5 * (soft.mask ^ disc(25)).sum()
+
+
+def test_a_missing_limb_is_found_where_photographs_are_blurred() -> None:
+    soft = out_of_focus(photographed(disc(25) & (COLUMNS < 55)), 1.5)
+    limb = disc(25) & (COLUMNS >= 55)
+    assert any((part & limb).sum() > 0.9 * limb.sum() for part in missing_parts(soft.mask, seen(soft).blurred()))
 
 
 def test_one_dark_side_does_not_make_a_mask_too_large() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
-from scipy.ndimage import binary_dilation, binary_erosion
+from scipy.ndimage import binary_dilation, binary_erosion, gaussian_filter
 
 import mvps.checks.silhouettes
 from mvps.checks.silhouettes import silhouettes
@@ -108,6 +109,16 @@ def with_blob(mask: Bool) -> Bool:
 def test_a_sound_capture_stays_as_it_is(sound: Capture) -> None:
     left, findings = silhouettes(sound)
     assert left is sound and not findings
+
+
+def test_masks_of_blurred_photographs_stay_as_they_are(folder: Path, tmp_path: Path) -> None:
+    place = shutil.copytree(folder, tmp_path / "blurred")
+    for path in place.glob("view_*/[0-9]*.png"):
+        image = np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+        cv2.imwrite(str(path), gaussian_filter(image.astype(np.float64), (1.5, 1.5, 0)).astype(np.uint16))
+    capture = read_capture(place)
+    left, findings = silhouettes(capture)
+    assert left is capture and not findings
 
 
 @pytest.mark.parametrize("lights", [[1], [2, 6, 10, 14, 18]])

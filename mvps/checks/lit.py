@@ -8,7 +8,9 @@ half of its mask is lit and what is far from the mask is dark, but for FEW pixel
 
 A pixel belongs to a mask where its centre sees the object. Pixels that the object covers by less than half, and those that a lens blurs
 its light into, are lit too but much darker than their neighbours nearer to the object: the edge of the object outside a mask is where
-brightness falls by more than half from a pixel to the next, inside a mask it is where light begins.
+brightness falls by more than half from a pixel to the next, inside a mask it is where light begins. Where light goes on for more than a
+pixel beyond that in three quarters of the sectors of most views, a lens has blurred it: then the edge is no farther out than where
+brightness falls by most, which no blur moves (Marr and Hildreth 1980).
 
 Where the background is not dark, w is a polynomial of second degree along both axes of the picture, fitted to what is far from the mask
 by Cauchy's reweighted squares, and |b - w| takes the place of b: up to NOISE times its scatter it is the wall, above the object. A wall has
@@ -17,7 +19,8 @@ shadows of the object, which differ too: against it masks are found too large, n
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,20 +76,35 @@ BLOCK = np.ones((3, 3), bool)
 
 @dataclass(frozen=True, eq=False)
 class Lit:
-    """lit (height, width) where photographs show light; object: without pixels that the object covers by less than half; edges: pixels
-    from the mask's boundary out to the object's edge, (sectors,); judged: whether they tell object from background; dark: whether that is
-    a dark one."""
+    """lit (height, width) where photographs show light; object: without pixels that the object covers by less than half; pixels from the
+    mask's boundary, (sectors,), out to the object's edge (edges), to where brightness falls by most (steepest), and to where light ends
+    (ends); judged: whether they tell object from background; dark: whether that is a dark one; blur: pixels beyond the edge that a lens
+    lights, if it is known to."""
 
     lit: Bool
     object: Bool
     edges: NDArray[np.float64]
+    steepest: NDArray[np.float64]
+    ends: NDArray[np.float64]
     judged: bool
     dark: bool
+    blur: float = 0.0
 
     @property
     def edge(self) -> float:
         """Median over the sectors."""
         return float(np.median(self.edges))
+
+    @property
+    def beyond(self) -> float:
+        """Pixels that light goes on beyond the edge in three quarters of the sectors: of a sharp one less than the pixel that it covers in
+        part."""
+        return float(np.quantile(self.ends - self.edges, 0.25))
+
+    def blurred(self) -> Lit:
+        """The same of photographs that a lens has blurred: edges no farther out than where brightness falls by most."""
+        edges = np.minimum(self.edges, self.steepest)
+        return replace(self, edges=edges, blur=float(np.quantile(self.ends - edges, 0.75)))
 
     @property
     def off(self) -> bool:
@@ -176,11 +194,12 @@ def _told_apart(view: View, distance: NDArray[np.float32], frame: NDArray[np.flo
     far = distance > REACH
     deep = view.mask & (distance <= np.median(distance[view.mask]))
     judged = bool(lit[deep].mean() >= 1 - FEW and far.any() and lit[far].mean() <= FEW)
-    return Lit(lit, half, _edges(view, frame, distance, lit), judged, dark)
+    edges, steepest, ends = _edges(view, frame, distance, lit)
+    return Lit(lit, half, edges, steepest, ends, judged, dark)
 
 
-def _edges(view: View, frame: NDArray[np.float32], distance: NDArray[np.float32], lit: Bool) -> NDArray[np.float64]:
-    """(sectors,) distance from the mask's boundary out to the object's edge; negative where that lies inside."""
+def _edges(view: View, frame: NDArray[np.float32], distance: NDArray[np.float32], lit: Bool) -> list[NDArray[np.float64]]:
+    """Edges, steepest and ends (sectors,) of Lit: distances out from the mask's boundary; negative where the object ends inside."""
     near = np.abs(distance) < REACH
     surface = np.where(view.mask, lit, lit & (frame >= STEEP * _nearer(frame, distance)))
     rows, columns = np.nonzero(near)
@@ -191,11 +210,16 @@ def _edges(view: View, frame: NDArray[np.float32], distance: NDArray[np.float32]
     at = sector * 2 * REACH + ring
     shape, cells = (SECTORS, 2 * REACH), SECTORS * 2 * REACH
     pixels = np.bincount(at, minlength=cells).reshape(shape)
-    bright = np.bincount(at, surface[near], cells).reshape(shape)
+
+    def mean(of: NDArray[np.generic], without: Any) -> NDArray[np.float64]:
+        return np.where(pixels > 0, np.bincount(at, of[near], cells).reshape(shape) / np.maximum(pixels, 1), without)
+
     # Where a sector has no such pixels (a thin part) nothing speaks against the mask.
-    share = np.where(pixels > 0, bright / np.maximum(pixels, 1), np.arange(2 * REACH) < REACH)
-    outwards, inwards = share[:, REACH:], 1 - share[:, REACH - 1 :: -1]
-    return _run(outwards) - _run(inwards)
+    inside = np.arange(2 * REACH) < REACH
+    share, level = mean(surface, inside), mean(frame, 0)
+    outwards, inwards = _run(share[:, REACH:]), _run(1 - share[:, REACH - 1 :: -1])
+    falls = level[:, REACH - 1 : -1] - level[:, REACH:]
+    return [out - inwards for out in (outwards, falls.argmax(1), _run(mean(lit, inside)[:, REACH:]))]
 
 
 def _nearer(frame: NDArray[np.float32], distance: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -234,8 +258,9 @@ def stray_parts(mask: Bool, found: Lit) -> list[Bool]:
 
 
 def missing_parts(mask: Bool, found: Lit) -> list[Bool]:
-    """Lit parts outside a mask that touch it and hold a block."""
-    return [part for part in _parts(found.object & ~mask) if (_grown(part) & mask).any()]
+    """Lit parts outside a mask that touch it, hold a block and reach farther from it than a lens blurs light, and a pixel."""
+    beyond = steps(mask) > found.blur + 1
+    return [part for part in _parts(found.object & ~mask) if (_grown(part) & mask).any() and (part & beyond).any()]
 
 
 def _grown(part: Bool) -> Bool:

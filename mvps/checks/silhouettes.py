@@ -63,22 +63,25 @@ def silhouettes(capture: Capture) -> tuple[Capture, list[Finding]]:
     return left, [*findings, *of_parts, *of_views]
 
 
-def _seen(view: View) -> tuple[Lit | None, Bool | None]:
-    """What the photographs show, and the mask moved to it where it is off as a whole."""
-    distance = steps(view.mask)
-    found = lit_part(view, distance)
-    return found, moved(view, distance, found) if found is not None and found.off and view.files else None
+def _shown(capture: Capture) -> list[Lit | None]:
+    """What the photographs show. A lens blurs all alike; in a single one shadows may look so."""
+    found = on_cores(lambda view: lit_part(view, steps(view.mask)), capture.views)
+    beyond = [one.beyond for one in found if one is not None and one.judged]
+    blurred = bool(beyond) and np.median(beyond) > 1
+    return [one.blurred() if blurred and one is not None else one for one in found]
 
 
 def _moved(capture: Capture) -> tuple[Capture, list[Lit | None], list[Finding]]:
     """Masks that are off as a whole, with their boundary where the object ends; what the photographs show beside them; what was found."""
-    seen = on_cores(_seen, capture.views)
-    views, shown, edges = list(capture.views), [found for found, _ in seen], {}
-    for at, (found, mask) in enumerate(seen):
+    shown = _shown(capture)
+    views, edges = list(capture.views), {}
+    for at, (view, found) in enumerate(zip(capture.views, shown, strict=True)):
+        mask = moved(view, steps(view.mask), found) if found is not None and found.off and view.files else None
         if found is not None and mask is not None and mask.any():
-            views[at] = with_mask(views[at], mask)
-            shown[at] = lit_part(views[at], steps(mask))
-            edges[views[at].name] = found.edge
+            views[at] = with_mask(view, mask)
+            again = lit_part(views[at], steps(mask))
+            shown[at] = again.blurred() if again is not None and found.blur else again
+            edges[view.name] = found.edge
     if not edges:
         return capture, shown, []
     where = "all views" if len(edges) == len(views) else ", ".join(edges)
