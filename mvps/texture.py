@@ -34,6 +34,7 @@ from mvps.cores import on_cores, one_by_one
 from mvps.gleam import Senders
 from mvps.mesh import face_areas, lengths, nearest, normalise, vertex_normals
 from mvps.pbr import glossy, srgb_bytes, white_level
+from mvps.pixel_samples import DARK
 from mvps.rendering import Arriving, diffuse_shading, light_arriving, light_senders, points_under, shadow_at, specular_shading
 from mvps.scene import Bool, Capture, Float, Int, Law, Lights, Material, Surface, View
 from mvps.texel_normals import Places, Shown, texel_normals
@@ -197,6 +198,9 @@ def pixel_albedo(
     known = np.zeros(len(view.pixels), bool)
     level = intensity.mean(1).astype(np.float32)
     ratio = intensity / level[:, None]
+    # Noise of a channel that a light lacks is not magnified: samples stay as dark there, and so does what they are held against.
+    over = np.maximum(ratio, DARK)
+    strength = (level[:, None] * (ratio / over)).astype(np.float32).T[:, None]
     step = max(1, SAMPLES_PER_CHUNK // max(1, len(direction)))
     for start in range(0, len(position), step):
         part = slice(start, start + step)
@@ -210,10 +214,10 @@ def pixel_albedo(
         if arriving is not None:
             of_albedo, of_lobes = arriving.at(points)
             diffuse, highlight = diffuse + np.moveaxis(of_albedo, -1, 0), highlight + of_lobes
-        white = np.moveaxis(view.samples[part], -1, 0).astype(np.float32) * (view.scale / ratio.T[:, None]).astype(np.float32)
-        measured = white - np.moveaxis(highlight, -1, 0) * level
+        white = np.moveaxis(view.samples[part], -1, 0).astype(np.float32) * (view.scale / over.T[:, None]).astype(np.float32)
+        measured = white - np.moveaxis(highlight, -1, 0) * strength
         position[part] = points.position
-        albedo[part] = _robust_albedo(measured, diffuse * level, usable).T
+        albedo[part] = _robust_albedo(measured, diffuse * strength, usable).T
         known[part] = usable.any(1)
     return position, albedo, known
 

@@ -16,6 +16,7 @@ from mvps.joint.colours import LobeColour, _white, colours, light_ratios, lobes_
 from mvps.joint.grey import grey_lights
 from mvps.joint.observe import channel_ratio, observe
 from mvps.joint.reflectance import Observed
+from mvps.pixel_samples import grey_under
 
 CPU = torch.device("cpu")
 
@@ -178,6 +179,35 @@ def test_in_front_of_a_known_object_lights_may_all_be_red(tint: tuple[float, flo
     true = ratios[0] * red
     found = ratios_of_known(of, albedo, np.tile(tint, (len(albedo), 1)), True)[0]
     assert np.abs(found / (true / true.mean(1, keepdims=True)) - 1).mean() < 0.005
+
+
+@pytest.mark.parametrize("noise", [0.0, 130.0])
+def test_lamps_of_one_channel_have_their_colours_and_leave_the_albedo(noise: float) -> None:
+    """Of channels that a lamp lacks photographs show nothing, by which nothing can be divided, or noise, which is no light. In 16 bits."""
+    of, ratios, albedo = observed(WHITE)
+    colour = np.ones_like(ratios[0])
+    colour[:3] = 3 * np.eye(3)
+    rng = np.random.default_rng(0)
+    pictures = []
+    for view in of.capture.views:
+        values = view.samples * colour / 3
+        values += rng.normal(0, noise, values.shape)
+        pictures.append(replace(view, samples=np.rint(values.clip(0)).astype(np.uint16)))
+    dimmer = of.vertices.reflectance / 3
+    vertices = replace(of.vertices, reflectance=dimmer, scale=0.1 * dimmer[:, 0])
+    of = of._replace(capture=replace(of.capture, views=tuple(pictures)), vertices=vertices)
+    found = light_ratios(of, ratios, True)
+    assert all((ratio > 0).all() for ratio in found) and (np.diag(found[0][:3]) > 2.95).all()
+    coloured, _ = colours(of, found, LobeColour.WHITE)
+    assert np.nanmedian(np.abs(3 * coloured - albedo)) < 0.01
+
+
+def test_noise_of_channels_that_a_lamp_lacks_is_not_magnified() -> None:
+    """Over a lamp of 3 : 0.03 : 0.01 it was 35 times a channel's; now three times."""
+    colour = np.array([[1.0, 1.0, 1.0], [2.96, 0.03, 0.01]])
+    noise = np.random.default_rng(0).normal(0, 20, (1000, 2, 3))
+    grey = grey_under(np.rint(3000 * colour + noise).clip(0).astype(np.uint16), colour)
+    assert np.abs(grey.mean(0) / 3000 - 1).max() < 0.01 and (grey.std(0) < 4 * 20).all()
 
 
 def test_a_coloured_lamp_among_white_ones_tints_nothing() -> None:

@@ -25,6 +25,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio, grey_radiance, interi
 from mvps.joint.pixels import WEIGHT_TIE
 from mvps.joint.steps import CORRELATED, Anchor, free_reflectance, vertex_step, with_population
 from mvps.mesh import lengths, normalise
+from mvps.pixel_samples import light_shares
 from mvps.scene import Bool, Camera, Float, Int, Law, View
 from solvers.bounded import minimise
 
@@ -83,7 +84,7 @@ class _Pixels:
             torch.from_numpy(image[rows]).to(device),
             torch.from_numpy(usable[rows]).to(device),
         )
-        total = np.maximum((view.samples[rows] / ratio.astype(np.float32)).sum(1), 1.0)
+        total = np.maximum((view.samples[rows] / ratio.astype(np.float32) * light_shares(ratio)).sum(1), 1.0)
         self.chroma = np.log(total / total.mean(1, keepdims=True))
         self.law, self.device = law, device
         self.level = self.samples.image.square().mean(1).sqrt().clamp_min(1e-12)

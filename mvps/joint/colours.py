@@ -7,7 +7,8 @@ weights w_k shows
 
 where t is the lobes' colour: white on dielectrics, the body's on metals. Once albedos are known, what diffuse surfaces send has their
 colour, b G_c (bounce.py); where lobes take part in it (gleam.py) it counts as grey. Every vertex's albedo is eliminated (variable
-projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance,
+projection: Golub and Pereyra 1973), and with sums <.> over its samples, divided by its residual variance and less of channels that a light
+lacks (`told_by_channels`),
 
     a_c = (<q_c y_c> - t_c <q_c S>) / <q_c q_c>,   at least 0
 
@@ -56,6 +57,7 @@ from mvps.gleam import Senders, terms
 from mvps.joint.reflectance import Chunk, Observed, chunks
 from mvps.joint.trial import parted
 from mvps.material import POOR_FIT, Trial, judged
+from mvps.pixel_samples import DARKEST, told_by_channels
 from mvps.scene import Bool, Float
 from mvps.shading import most_albedo
 
@@ -98,14 +100,17 @@ def _sums(of: Observed, ratios: Sequence[Float], samples_of: Callable[[int], Ite
     def of_view(i: int) -> _Sums:
         out = _Sums(*(np.zeros((len(of.views[i].vertex), 3)) for _ in _Sums._fields))
         ratio, more = ratios[i].astype(np.float32), None if beyond_grey is None else beyond_grey(i)
+        told = told_by_channels(ratios[i]).astype(np.float32)
         for chunk in samples_of(i):
             w, q, S, y = chunk.weight / scale[chunk.rows, None] ** 2, chunk.basis, chunk.predicted - chunk.diffuse, chunk.image / ratio
+            told_y = told * y
             if more is None:
-                qq, qS, qy = (w * q * q).sum(1, keepdims=True), (w * q * S).sum(1, keepdims=True), _over_lights(w * q, y)
+                qq, qS, qy = _by_channels(w * q * q, told), _by_channels(w * q * S, told), _over_lights(w * q, told_y)
             else:
                 q_c = q[..., None] + more(chunk.part)
-                qq, qS, qy = _over_lights(w, q_c * q_c), _over_lights(w * S, q_c), _over_lights(w, q_c * y)
-            sums = qq, qS, (w * S * S).sum(1, keepdims=True), qy, _over_lights(w * S, y), _over_lights(w, y * y)
+                told_q = told * q_c
+                qq, qS, qy = _over_lights(w, told_q * q_c), _over_lights(w * S, told_q), _over_lights(w, q_c * told_y)
+            sums = qq, qS, _by_channels(w * S * S, told), qy, _over_lights(w * S, told_y), _over_lights(w, told_y * y)
             for total, of_chunk in zip(out, sums, strict=True):
                 total[chunk.part] = of_chunk
         return out
@@ -121,6 +126,11 @@ def _sums(of: Observed, ratios: Sequence[Float], samples_of: Callable[[int], Ite
 def _over_lights(weight: Single, values: Single) -> Single:
     """(n, 3) sums of values (n, lights, 3) with weights (n, lights)."""
     return (weight[:, None] @ values)[:, 0]
+
+
+def _by_channels(values: Single, told: Single) -> Single:
+    """(n, 3) sums of values (n, lights) by how much the lights' channels tell (lights, 3); (n, 1) where all tell as much."""
+    return values.sum(1, keepdims=True) if (told == 1).all() else values @ told
 
 
 def _beyond_grey(of: Observed, sent: Senders) -> Callable[[int], Callable[[slice], Single]]:
@@ -296,7 +306,7 @@ def _ratios(sums: list[tuple[Float, Float]], one_rig: bool) -> list[Float]:
     ratios = [top / np.maximum(bottom, 1e-300) for top, bottom in sums]
     # Of a photograph that was left out no sample speaks: white.
     ratios = [np.where(ratio.sum(1, keepdims=True) > 0, ratio, 1.0) for ratio in ratios]
-    return [_relative(ratio) for ratio in ratios]
+    return [_relative(np.maximum(ratio, DARKEST * ratio.mean(1, keepdims=True))) for ratio in ratios]
 
 
 def _white(ratios: list[Float]) -> list[Float]:

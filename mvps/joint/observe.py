@@ -4,10 +4,11 @@ A vertex takes part in a view that sees it; its sample under light l is the bili
 
     I_l = mean over channels of radiance_c / ratio_lc,     ratio = intensity over its mean over the channels,
 
-so that what is left of a light is one number, its mean intensity. Samples that are saturated or whose light another part of the mesh hides
-are no data, nor are those beside them. A pair (vertex, view) is weighted by cos^2 of the viewing angle (a pixel covers 1 / cos of the
-surface, and an error of the position moves the projection by as much again), times the part of its four pixels that is foreground at least
-one pixel away from the mask's boundary, where pixels mix object and background.
+so that what is left of a light is one number, its mean intensity; channels that a light lacks count less (`channel_shares`). Samples that
+are saturated or whose light another part of the mesh hides are no data, nor are those beside them. A pair (vertex, view) is weighted by
+cos^2 of the viewing angle (a pixel covers 1 / cos of the surface, and an error of the position moves the projection by as much again),
+times the part of its four pixels that is foreground at least one pixel away from the mask's boundary, where pixels mix object and
+background.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from mvps.camera import bilinear, project, view_directions
 from mvps.cores import on_cores
 from mvps.gleam import Senders, terms
 from mvps.once import once_for
+from mvps.pixel_samples import channel_shares
 from mvps.scene import Bool, Capture, Float, Int, Lights, Surface, View
 from mvps.visibility import RayCaster, ray_caster, shade_of, visible_vertices
 
@@ -115,7 +117,8 @@ def channel_ratio(intensity: Float) -> Float:
 def grey_radiance(view: View, intensity: Float) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Of a view's foreground pixels (pixels, lights): grey radiance, what is left of a light being its mean intensity, and where no
     channel is saturated."""
-    per_channel = (view.scale / (3 * channel_ratio(intensity))).astype(np.float32)
+    ratio = channel_ratio(intensity)
+    per_channel = (view.scale * channel_shares(ratio) / (3 * ratio)).astype(np.float32)
     red, green, blue = (view.samples[..., c] * per_channel[:, c] for c in range(3))
     red += green
     red += blue

@@ -22,6 +22,7 @@ from mvps.joint.observe import SHADOW_MARGIN, ViewSamples, channel_ratio, grey_r
 from mvps.joint.steps import Anchor, confidence, vertex_step
 from mvps.joint.thinned import kept
 from mvps.mesh import normalise
+from mvps.pixel_samples import light_shares
 from mvps.rendering import points_under, shadow_at
 from mvps.scene import Bool, Capture, Float, Int, Lights, Material, NormalMap, Surface, View
 from mvps.visibility import RayCaster, ray_caster
@@ -70,7 +71,8 @@ def _beside(view: View, rows: Int, shadow: Bool) -> Bool:
 
 def _chroma(view: View, intensity: Float, rows: Int) -> NDArray[np.float32]:
     """(n, 3) share of the channels in a pixel's radiance under white light, mean 1."""
-    samples, per_channel = view.samples[rows], (view.shown[:, None] / channel_ratio(intensity)).astype(np.float32)
+    ratio, samples = channel_ratio(intensity), view.samples[rows]
+    per_channel = (view.shown[:, None] * light_shares(ratio) / ratio).astype(np.float32)
     white = np.column_stack([np.einsum("pl,l->p", samples[..., c].astype(np.float32), per_channel[:, c]) for c in range(3)])
     chroma: NDArray[np.float32] = white / np.maximum(white.mean(1, keepdims=True), 1e-12)
     return chroma
