@@ -228,6 +228,7 @@ def _robust_albedo(measured: NDArray[np.float32], diffuse: NDArray[np.float32], 
     The channels share their weights: a highlight or a shadow's border is an outlier in all of them.
     """
     weight = usable.astype(np.float32)
+    count = np.maximum(weight.sum(1, keepdims=True), 1)
     albedo = np.zeros(measured.shape[:2], np.float32)
     for _ in range(REWEIGHTINGS):
         residual = np.zeros_like(weight)
@@ -237,7 +238,7 @@ def _robust_albedo(measured: NDArray[np.float32], diffuse: NDArray[np.float32], 
             albedo[c] = np.einsum("nl,nl->n", weighted, image) / np.maximum(bottom, np.float32(1e-30))
             residual += np.abs(image - albedo[c, :, None] * shading)
         residual *= usable
-        bound = residual.mean(1, keepdims=True) / 2 + np.float32(1e-12)
+        bound = residual.sum(1, keepdims=True) / (2 * count) + np.float32(1e-12)
         weight = usable / (1 + (residual / bound) ** 2)
     return albedo.clip(0)
 
