@@ -14,6 +14,7 @@ from mvps.gleam import patches_of, senders
 from mvps.joint.blocks import Vertices
 from mvps.joint.colours import LobeColour, _white, colours, light_ratios, lobes_in_colour, ratios_of_known
 from mvps.joint.grey import grey_lights
+from mvps.joint.held_out import fit_lights
 from mvps.joint.observe import channel_ratio, observe
 from mvps.joint.reflectance import Observed
 from mvps.pixel_samples import grey_under
@@ -200,6 +201,16 @@ def test_lamps_of_one_channel_have_their_colours_and_leave_the_albedo(noise: flo
     assert all((ratio > 0).all() for ratio in found) and (np.diag(found[0][:3]) > 2.95).all()
     coloured, _ = colours(of, found, LobeColour.WHITE)
     assert np.nanmedian(np.abs(3 * coloured - albedo)) < 0.01
+
+
+def test_coloured_lights_in_front_of_a_known_object_are_as_strong_as_they_are() -> None:
+    """The channels' plain mean under a red light is brighter on a red object: levels were 0.8 % off, 1.6 at most; now 0.06 and 0.09."""
+    scene = make_sphere(4)
+    r = scene.reconstruction
+    found = fit_lights(scene.capture, r.surface, r.material, True, CPU)
+    level, true = found.intensity[0].mean(1), r.lights.intensity[0].mean(1)
+    assert np.abs(level / true - 1).max() < 0.004
+    np.testing.assert_allclose(found.intensity[0], r.lights.intensity[0], rtol=0.005)
 
 
 def test_noise_of_channels_that_a_lamp_lacks_is_not_magnified() -> None:

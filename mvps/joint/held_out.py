@@ -1,6 +1,7 @@
 """Lights of photographs that were kept back, for a finished reconstruction: normals and reflectance stand still.
 
-Start: least squares of Lambert's part, I = a n . m, then Gauss-Newton on the whole image model (blocks.py) with shadows traced anew.
+Start: least squares of Lambert's part, I = a n . m, then Gauss-Newton on the whole image model (blocks.py) with shadows traced anew, twice,
+the second time with the lights' colours taken out of the photographs.
 Views of one rig share their lights; the rig's lights carry over to a view that was kept back without any fit.
 """
 
@@ -16,11 +17,12 @@ from mvps.gleam import coarse_senders
 from mvps.joint.blocks import DirectionalLights, Vertices, evaluate, light_jacobian, robust
 from mvps.joint.colours import ratios_of_known
 from mvps.joint.lighting import LIGHT_VERTICES, drawn
-from mvps.joint.observe import ViewSamples, channel_ratio, observe, with_gathered
+from mvps.joint.observe import ViewSamples, observe, with_gathered
 from mvps.joint.reflectance import Observed
 from mvps.scene import Camera, Capture, Float, Law, Lights, Material, Surface
 
-STEPS = 6
+STEPS, TIMES = 6, 2
+"""Of Gauss and Newton; and how often they are done, under colours and shadows of the lights that were found before."""
 
 
 def carried_over(lights: Lights, first: Camera, camera: Camera) -> tuple[Float, Float]:
@@ -121,15 +123,17 @@ def fit_lights(capture: Capture, surface: Surface, material: Material, one_rig: 
     products = _lambertian(views, vertices, rotations, one_rig)
     grey = [_from_product(m, rotation) for m, rotation in zip(products, rotations, strict=True)]
     sent = coarse_senders(surface, material, grey=True)
-    for _ in range(2):
-        lights = _as_lights(grey, [channel_ratio(e) for e in white], start)
+    ratios, generator = white, np.random.default_rng(0)
+    for _ in range(TIMES):
+        lights = _as_lights(grey, ratios, start)
         views = observe(capture, surface, lights, device, shadows=material.law.shadows)
         if sent is not None:
             views = with_gathered(views, capture, surface, sent, lights)
         for _ in range(STEPS):
             grey = _step(views, vertices, grey, material.law, rotations, one_rig)
-    some = drawn(views, LIGHT_VERTICES, np.random.default_rng(0))
-    rows = [samples.of_vertices(some, len(vertices.normal)) for samples in views]
-    of = Observed(capture, surface, rows, vertices, grey, material.law)
-    ratios = ratios_of_known(of, material.albedo, _tint(material), one_rig)
+        some = drawn(views, LIGHT_VERTICES, generator)
+        rows = [samples.of_vertices(some, len(vertices.normal)) for samples in views]
+        of = Observed(capture, surface, rows, vertices, grey, material.law)
+        # The channels' plain mean of an object in colours, under lights in colours, is not as bright as under white ones.
+        ratios = ratios_of_known(of, material.albedo, _tint(material), one_rig)
     return _as_lights(grey, ratios, start)
