@@ -23,6 +23,7 @@ from torch.nn.functional import normalize
 
 from mvps.camera import pixel_centres, rays
 from mvps.cores import on_cores
+from mvps.pixel_samples import channel_shares
 from mvps.scene import RELIABLE, Capture, Float, Lights, NormalMap, View
 from solvers.least_squares import ascending, cauchy_weights, weighted_rows
 
@@ -50,20 +51,25 @@ def normal_map(view: View, direction: Float, intensity: Float, device: torch.dev
     # Of photographs that were left out nothing is known, least of all that they are bright.
     shown: slice | list[int] = slice(None) if view.shown.all() or not view.shown.any() else np.flatnonzero(view.shown).tolist()
     light, per_channel = tensor(direction[shown]), tensor(view.scale / intensity[shown])
+    shares = tensor(channel_shares(intensity[shown] / intensity[shown].mean(1, keepdims=True)))
     towards, usable = tensor(-rays(view.camera, pixel_centres(view.pixels))[1]), view.usable(shown)
     columns: list[tuple[Tensor, ...]] = []
     for start in range(0, len(view.pixels), PIXELS_PER_CHUNK):
         part = slice(start, start + PIXELS_PER_CHUNK)
         radiance = torch.from_numpy(view.samples[part][:, shown].astype(np.float32)).to(device) * per_channel
         known = torch.from_numpy(usable[part]).to(device).double()
-        columns.append(tuple(values.float() for values in pixels_solved(radiance, known, light, towards[part], noise)))
+        columns.append(tuple(values.float() for values in pixels_solved(radiance, known, light, towards[part], noise, shares)))
     normal, albedo, confidence = (torch.cat(column).cpu().numpy() for column in zip(*columns, strict=True))
     return NormalMap(normal, albedo, confidence)
 
 
-def pixels_solved(radiance: Tensor, known: Tensor, light: Tensor, towards: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+def pixels_solved(
+    radiance: Tensor, known: Tensor, light: Tensor, towards: Tensor, noise: float, shares: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """Normals, albedo (n, 3) and confidence (n,) for radiance over intensity (n, lights, 3), where it is known (n, lights), the lights'
-    directions (lights, 3) and those to the camera (n, 3); float64. noise: of a sample over intensity."""
+    directions (lights, 3) and those to the camera (n, 3); float64. noise: of a sample over intensity; shares (lights, 3): of the channels
+    in what is grey."""
+    radiance = radiance * shares
     red, green, blue = radiance.unbind(-1)
     b, weight, sigma = _solve((red + green + blue) / 3, known, light, noise)
     length = b.norm(dim=1, keepdim=True)
@@ -73,7 +79,7 @@ def pixels_solved(radiance: Tensor, known: Tensor, light: Tensor, towards: Tenso
     beyond = (unit * towards).sum(1, keepdim=True).clamp_max(0)
     normal = normalize(unit - beyond * towards, dim=1)
     confidence = torch.where(solved, 1 / (1 + (sigma / RELIABLE) ** 2), 0.0)
-    return normal, _albedo(radiance, (normal @ light.T).clamp_min(0), weight), confidence
+    return normal, _albedo(radiance, (normal @ light.T).clamp_min(0), weight, shares), confidence
 
 
 def _quantile(rows: Tensor, share: float) -> Tensor:
@@ -100,8 +106,9 @@ def _solve(image: Tensor, known: Tensor, light: Tensor, noise: float) -> tuple[T
     return b, weight, torch.where(enough, sigma, torch.inf)
 
 
-def _albedo(radiance: Tensor, shading: Tensor, weight: Tensor) -> Tensor:
-    """(n, 3) least-squares albedo per channel of radiance (n, lights, 3) for given shading (n, lights)."""
+def _albedo(radiance: Tensor, shading: Tensor, weight: Tensor, shares: Tensor) -> Tensor:
+    """(n, 3) least-squares albedo per channel of radiance times shares (n, lights, 3) for given shading (n, lights)."""
     weighted = weight * shading
-    denominator = (weighted * shading).sum(1).clamp_min(1e-12)
-    return ((weighted[:, None] @ radiance)[:, 0] / denominator[:, None]).clamp_min(0)
+    square = weighted * shading
+    denominator = square.sum(1, keepdim=True) if bool((shares == 1).all()) else square @ shares
+    return ((weighted[:, None] @ radiance)[:, 0] / denominator.clamp_min(1e-12)).clamp_min(0)

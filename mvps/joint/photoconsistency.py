@@ -27,6 +27,7 @@ from mvps.joint.observe import ViewSamples, channel_ratio, interior
 from mvps.joint.pixels import OWN_LIGHTS
 from mvps.joint.reflectance import Observed
 from mvps.mesh import vertex_normals
+from mvps.pixel_samples import DARK
 from mvps.scene import Float, Int, Lights, Surface, View
 
 MOST = OWN_LIGHTS - 1
@@ -37,10 +38,11 @@ FAINTEST_LIGHT = 0.05
 
 
 def radiance_image(view: View, light: int, ratio: Float) -> NDArray[np.float32]:
-    """(height, width, 4) radiance of a photograph over its light's colour (3,), and 1; 0 where it is saturated or not inside the object."""
+    """(height, width, 4) radiance of a photograph over its light's colour (3,), DARK at least, and 1; 0 where it is saturated or not inside
+    the object."""
     image = np.zeros((*view.mask.shape, 4), np.float32)
     usable = interior(view) * view.usable()[:, light]
-    image[view.mask, :3] = view.samples[:, light] * (view.scale / ratio) * usable[:, None]
+    image[view.mask, :3] = view.samples[:, light] * (view.scale / np.maximum(ratio, DARK)) * usable[:, None]
     image[view.mask, 3] = usable
     return image
 
