@@ -57,6 +57,15 @@ def test_what_is_absent_is_absent(capture: Path) -> None:
     assert read_truth(capture).views == ("view_01",)
 
 
+def test_points_without_a_face_are_no_part_of_the_true_surface(with_truth: Path) -> None:
+    corners = [[-1e4, 0, 0], [0, 0, 0], [1, 0, 0], [5, 5, 5], [0, 1, 0]]
+    trimesh.Trimesh(corners, [[1, 2, 4]], process=False).export(with_truth / "mesh_Gt.ply")
+    surface = read_truth(with_truth).surface
+    assert surface is not None
+    np.testing.assert_array_equal(surface.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_array_equal(surface.faces, [[0, 1, 2]])
+
+
 def test_calibrated_lights_are_matched_by_number(with_truth: Path) -> None:
     lights = read_calibrated_lights(with_truth, read_capture(with_truth, lights={"view_01": [3], "view_02": [1, 2]}))
     everything = read_truth(with_truth)

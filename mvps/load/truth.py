@@ -29,7 +29,7 @@ from mvps.load.calibration import LARGEST, read_calibration
 from mvps.load.diligent import view_folders
 from mvps.load.images import TEXT_LIMIT, complaint, read_bytes, read_mask
 from mvps.load.matfile import numbers_of, read_variables
-from mvps.mesh import normalise
+from mvps.mesh import normalise, without_unused_vertices
 from mvps.scene import Camera, Capture, Float, Lights, Surface, Truth
 
 ONE_RIG_TOLERANCE = 1e-3
@@ -171,7 +171,8 @@ def _surface(path: Path) -> Surface:
     try:
         # Without a folder to look in and without materials no other file is opened.
         mesh = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False, skip_materials=True)
-        return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        # Scanners leave single points, which are no part of the surface, its size or its vertices.
+        return without_unused_vertices(Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
     except (*DAMAGED, AssertionError) as error:
         raise complaint(
             path, "a triangle mesh as PLY", f"one that cannot be read ({str(error)[:200]})", "copy or export it again"
