@@ -169,10 +169,10 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
 
     perceptual = perceptual_distance(lpips_weights) if lpips_weights is not None else None
     reconstruction, true_values = read_reconstruction(result), read_truth(truth)
-    if true_values.surface is None and not true_values.normals and not true_values.direction:
+    if not has_truth(true_values):
         raise CaptureError(
-            f"{truth}: wanted ground truth (mesh_Gt.ply, or Normal_gt.mat or light_directions.txt in the views), given none;"
-            " give a capture that has some"
+            f"{truth}: wanted ground truth (mesh_Gt.ply, or Normal_gt.mat, light_directions.txt or light_intensities.txt in the views),"
+            " given none; give a capture that has some"
         )
     capture = read_views(truth, reconstruction, true_values)
     if was_mended(reconstruction):
@@ -181,6 +181,11 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
     for protocol in protocols:
         errors |= figures_of(protocol, reconstruction, capture, true_values, support_height(capture, true_values), perceptual)
     return errors
+
+
+def has_truth(truth: Truth) -> bool:
+    """Whether there is anything to measure against."""
+    return truth.surface is not None or any((truth.normals, truth.direction, truth.intensity))
 
 
 def support_height(capture: Capture, truth: Truth) -> float | None:

@@ -181,14 +181,29 @@ def test_one_light_ten_per_cent_brighter() -> None:
 
 
 def test_lights_are_matched_by_view_and_number() -> None:
-    truth = Truth(("view_01", "view_02"), {}, {"view_01": ring(6), "view_02": ring(6)[::-1]}, {"view_01": np.ones((6, 3))}, None)
+    truth = Truth(("view_01", "view_02"), {}, {"view_01": ring(6)}, {"view_01": np.ones((6, 3))}, None)
     known = measures.true_lights(truth)
-    assert set(known) == {("view_01", k) for k in range(1, 7)}, "view_02 has no intensities"
+    assert set(known) == {("view_01", k) for k in range(1, 7)}, "of view_02 nothing is known"
     some = Lights((ring(6)[[4, 1]], ring(6)), (np.ones((2, 3)), np.ones((6, 3))), False)
     estimated = measures.by_photograph(some, ("view_01", "view_02"), ((5, 2), (1, 2, 3, 4, 5, 6)))
     errors = measures.light_errors(estimated, known)
     assert (errors["light_error_deg"], errors["intensity_error"]) == (0, 0)
     assert measures.light_errors(estimated, {}) == {}
+
+
+def test_directions_and_intensities_are_measured_each_where_they_are_known() -> None:
+    names, directions, intensities = ("view_01", "view_02"), {"view_01": ring(6)}, {"view_02": np.ones((6, 3))}
+    found = Lights((ring(6), ring(6)), (np.full((6, 3), 3.0), np.full((6, 3), 5.0)), False)
+    estimated = measures.by_photograph(found, names, ((1, 2, 3, 4, 5, 6),) * 2)
+    for direction, intensity, keys in (
+        (directions, {}, {"light_error_deg", "light_error_max_deg"}),
+        ({}, intensities, {"intensity_error"}),
+        (directions, intensities, {"light_error_deg", "light_error_max_deg", "intensity_error"}),
+    ):
+        known = measures.true_lights(Truth(names, {}, direction, intensity, None))
+        assert measures.light_errors(estimated, known) == dict.fromkeys(keys, 0.0)
+        of_psnerf = {f"psnerf_{key}" for key in keys} - {"psnerf_light_error_max_deg"}
+        assert measures.psnerf_light_errors(estimated, known, names) == dict.fromkeys(of_psnerf, 0.0)
 
 
 # photographs

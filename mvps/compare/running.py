@@ -22,7 +22,7 @@ from typing import Any
 
 from mvps.checkpoint import program
 from mvps.command import not_ended
-from mvps.evaluate import evaluate_result, write_json
+from mvps.evaluate import evaluate_result, has_truth, write_json
 from mvps.inputs import DAMAGED, JSON_LIMIT, parsed_json, read_file, shown
 from mvps.load import read_truth
 from mvps.progress import Progress
@@ -141,7 +141,6 @@ def _measured(run: Run, capture: Path, folder: Path, protocols: Sequence[str]) -
     new = tuple(name for name in protocols if name not in run.protocols)
     if run.failed or not new:
         return run
-    truth = read_truth(capture)
-    if truth.surface is None and not truth.normals and not truth.direction:
+    if not has_truth(read_truth(capture)):
         return run
     return replace(run, protocols=(*run.protocols, *new), errors=run.errors | evaluate_result(folder, capture, new))

@@ -30,33 +30,38 @@ def by_photograph(lights: Lights, views: Sequence[str], numbers: Sequence[Sequen
 
 
 def true_lights(truth: Truth) -> dict[Photograph, Light]:
-    """The true lights, by the photograph they lit, of the views whose directions and intensities are both known."""
-    return {
-        (view, k + 1): light
-        for view in truth.views
-        if view in truth.direction and view in truth.intensity
-        for k, light in enumerate(zip(truth.direction[view], truth.intensity[view], strict=True))
-    }
+    """The true lights, by the photograph they lit, of the views of which anything is known; NaN for what is not."""
+    lights: dict[Photograph, Light] = {}
+    for view in truth.views:
+        known = truth.direction.get(view, truth.intensity.get(view, np.zeros((0, 3))))
+        unknown = np.full(known.shape, np.nan)
+        pairs = zip(truth.direction.get(view, unknown), truth.intensity.get(view, unknown), strict=True)
+        lights |= {(view, k): light for k, light in enumerate(pairs, 1)}
+    return lights
 
 
 def light_errors(estimated: Mapping[Photograph, Light], truth: Mapping[Photograph, Light]) -> dict[str, float]:
-    """Mean and largest angle in degrees and relative intensity error, over all photographs that both know.
+    """Mean and largest angle in degrees and relative intensity error, each over all photographs of which both know it.
 
-    Directions are in the world frame; intensities are compared up to one scale for all. No common photograph gives no figures.
+    Directions are in the world frame; intensities are compared up to one scale for all. What the truth knows of no photograph that was
+    estimated gives no figures.
     """
     common = [photograph for photograph in estimated if photograph in truth]
     if not common:
         return {}
     direction, intensity = (np.stack(rows) for rows in zip(*(estimated[photograph] for photograph in common), strict=True))
     true_direction, true_intensity = (np.stack(rows) for rows in zip(*(truth[photograph] for photograph in common), strict=True))
-    angle = angles_deg(direction, true_direction)
-    scale = float((intensity * true_intensity).sum() / (intensity**2).sum())
-    relative = np.abs(scale * intensity - true_intensity) / true_intensity
-    return {
-        "light_error_deg": float(angle.mean()),
-        "light_error_max_deg": float(angle.max()),
-        "intensity_error": float(relative.mean()),
-    }
+    errors: dict[str, float] = {}
+    known = np.isfinite(true_direction).all(1)
+    if known.any():
+        angle = angles_deg(direction[known], true_direction[known])
+        errors |= {"light_error_deg": float(angle.mean()), "light_error_max_deg": float(angle.max())}
+    known = np.isfinite(true_intensity).all(1)
+    if known.any():
+        given, true = intensity[known], true_intensity[known]
+        scale = float((given * true).sum() / (given**2).sum())
+        errors["intensity_error"] = float((np.abs(scale * given - true) / true).mean())
+    return errors
 
 
 def held_out_views(reconstruction: Reconstruction) -> tuple[str, ...]:

@@ -74,11 +74,10 @@ def psnerf_normal_errors(
 def psnerf_light_errors(
     estimated: Mapping[Photograph, Light], truth: Mapping[Photograph, Light], fitted: Collection[str]
 ) -> dict[str, float]:
-    """Mean over the fitted views of their mean angle, deg, and relative error of intensity; no common photograph gives no figures."""
+    """Mean over the fitted views of their mean angle, deg, and relative error of intensity; no figure of what the truth lacks."""
     of_views = [light_errors({p: light for p, light in estimated.items() if p[0] == view}, truth) for view in fitted]
-    known = [errors for errors in of_views if errors]
-    keys = ("light_error_deg", "intensity_error") if known else ()
-    return {f"psnerf_{key}": float(np.mean([errors[key] for errors in known])) for key in keys}
+    found = {key: [errors[key] for errors in of_views if key in errors] for key in ("light_error_deg", "intensity_error")}
+    return {f"psnerf_{key}": float(np.mean(values)) for key, values in found.items() if values}
 
 
 def psnerf_image_errors(
