@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from mvps.command import parse, parser, run
-from mvps.folders import write_whole
+from mvps.folders import check_file, write_whole
 
 if TYPE_CHECKING:
     from mvps.scene import Capture, Reconstruction, Truth
@@ -244,6 +244,8 @@ def main(argv: Sequence[str]) -> None:
     options = parse(made, argv)
     if "lpips_weights" in options and "psnerf" not in options.protocols:
         made.error(f"--lpips-weights: wanted psnerf among --protocols, given {','.join(options.protocols)}")
+    if "json" in options:
+        check_file(options.json)
     errors = evaluate_result(options.result, options.truth, options.protocols, vars(options).get("lpips_weights"))
     from mvps.report import write_report
 

@@ -73,6 +73,15 @@ def write_whole(path: Path, content: str | bytes) -> None:
     replaced(path, lambda file: file.write(data))
 
 
+def check_file(path: Path) -> None:
+    """CaptureError unless a file can be written at this place, new or over another one."""
+    given = "a folder" if path.is_dir() else "no such folder" if not path.parent.is_dir() else ""
+    if not given and not os.access(path.parent, os.W_OK | os.X_OK):
+        given = "one that cannot be written"
+    if given:
+        raise CaptureError(f"{path}: wanted a file in a folder that is there and can be written, given {given}; give another place")
+
+
 def check_place(place: Path, marks: tuple[str, ...] = (), unfinished: str = "") -> None:
     """CaptureError unless the place can be written and is free, an empty folder, or one that may be replaced: with all the files named in
     `marks`, by which an earlier output of the same kind is known, or with nothing but what is called `unfinished`, the rest of an

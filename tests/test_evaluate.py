@@ -162,8 +162,11 @@ def test_bad_input_is_one_sentence(folders: tuple[Path, Path], result: Path, tmp
     assert "wanted the capture of the result's views view_11, view_12, view_13" in complaint([str(result), "--truth", str(other)], capsys)
     assert (result / "metrics.json").read_bytes() == before
 
-    nowhere = tmp_path / "missing" / "figures.json"
-    assert "missing" in complaint([str(folders[1]), "--truth", str(capture), "--json", str(nowhere)], capsys)
+    untouched = shutil.copytree(folders[1], tmp_path / "untouched")
+    for place, given in ((tmp_path / "missing" / "figures.json", "no such folder"), (tmp_path, "a folder")):
+        said = complaint([str(untouched), "--truth", str(capture), "--json", str(place)], capsys)
+        assert said.startswith(f"mvps: {place}: wanted a file in a folder that is there") and f"given {given};" in said
+        assert "truth" not in json.loads((untouched / "metrics.json").read_text()) and not (untouched / "report.html").exists()
 
 
 def test_a_truth_of_nothing_but_intensities_is_measured(folders: tuple[Path, Path], result: Path, tmp_path: Path) -> None:
