@@ -206,6 +206,12 @@ def protocol_list(text: str) -> tuple[str, ...]:
     return names
 
 
+def protocol_of(figure: str) -> str:
+    """The protocol that a figure is of, by its name."""
+    named = figure.partition("_")[0]
+    return named if named in PROTOCOLS else "ours"
+
+
 def reported(result: Path, truth: Path) -> tuple[Reconstruction, Capture]:
     """What the result's report is made of. CaptureError where it cannot be read."""
     from mvps.export import read_reconstruction
@@ -250,8 +256,9 @@ def main(argv: Sequence[str]) -> None:
     from mvps.report import write_report
 
     reconstruction, capture = reported(options.result, options.truth)
-    # What other protocols found stays.
-    metrics = reconstruction.metrics | {"truth": (reconstruction.metrics.get("truth") or {}) | errors}
+    # What other protocols found stays; what these found before, perhaps with more of the truth, does not.
+    others = {k: v for k, v in (reconstruction.metrics.get("truth") or {}).items() if protocol_of(k) not in options.protocols}
+    metrics = reconstruction.metrics | {"truth": others | errors}
     write_json(options.result / "metrics.json", metrics)
     write_report(replace(reconstruction, metrics=metrics), capture, options.result / "report.html")
     if "json" in options:

@@ -172,9 +172,13 @@ def test_bad_input_is_one_sentence(folders: tuple[Path, Path], result: Path, tmp
 def test_a_truth_of_nothing_but_intensities_is_measured(folders: tuple[Path, Path], result: Path, tmp_path: Path) -> None:
     ignored = shutil.ignore_patterns("mesh_Gt.ply", "Normal_gt.mat", "light_directions.txt")
     lamps = shutil.copytree(folders[0], tmp_path / "lamps", ignore=ignored)
+    assert run(main, [str(result), "--truth", str(folders[0]), "--protocols", "ours,psnerf"]) == 0
     assert run(main, [str(result), "--truth", str(lamps), "--json", str(tmp_path / "figures.json")]) == 0
     errors = json.loads((tmp_path / "figures.json").read_text())
     assert errors["intensity_error"] < 1e-6 and "light_error_deg" not in errors
+    kept = json.loads((result / "metrics.json").read_text())["truth"]
+    assert {key for key in kept if not key.startswith("psnerf_")} == set(errors), "figures of another truth are gone"
+    assert "psnerf_chamfer" in kept, "another protocol's stay"
 
 
 def test_a_file_that_cannot_be_written_whole_stays_as_it_was(tmp_path: Path) -> None:
