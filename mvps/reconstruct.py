@@ -208,7 +208,9 @@ def checkpoints_of(out: Path, capture: Capture, settings: Settings, lights: Ligh
     from mvps.material import Trial
     from mvps.scene import Material, Residual, Surface
 
-    run = {"settings": asdict(settings), "versions": versions(), "program": program(), "capture": fingerprint(capture, lights)}
+    # From wherever and by whatever path it is given, a capture is known by what it holds.
+    options = {name: value for name, value in asdict(settings).items() if name != "capture"}
+    run = {"settings": options, "versions": versions(), "program": program(), "capture": fingerprint(capture, lights)}
     kinds = (Refined, Surface, Material, Residual, Lights, NormalMap, Law, Trial, Vertices)
     return Checkpoints(out / CHECKPOINT, run, kinds, chosen_device(settings.device), resume)
 

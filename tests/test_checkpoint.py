@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ import torch
 
 from mvps.checkpoint import Checkpoints, program
 from mvps.command import run
+from mvps.load import read_capture
 from mvps.progress import Progress
-from mvps.reconstruct import main
+from mvps.reconstruct import Settings, checkpoints_of, main
 from mvps.scene import CaptureError, Law, Surface
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
@@ -97,6 +99,17 @@ def test_a_killed_run_goes_on_to_the_same_bytes(capture: Path, tmp_path: Path) -
     assert geometry(out) == geometry(tmp_path / "whole")
     stages = [stage["name"] for stage in json.loads((out / "metrics.json").read_text())["stages"]]
     assert stages == [stage["name"] for stage in json.loads((tmp_path / "whole" / "metrics.json").read_text())["stages"]]
+
+
+def test_a_run_goes_on_from_another_folder(capture: Path, tmp_path: Path) -> None:
+    photographs, whole, out = read_capture(capture), Settings(str(capture)), tmp_path / "out"
+    checkpoints_of(out, photographs, whole, None, False).step("a", lambda: 1, Progress())
+    relative = replace(whole, capture="made")
+    assert checkpoints_of(out, photographs, relative, None, True).step("a", lambda: 2, Progress()) == 1
+    part = photographs.select({view.name: view.lights for view in photographs.views[1:]})
+    for other, settings in ((part, relative), (photographs, replace(relative, seed=1))):
+        with pytest.raises(CaptureError, match="given those of another"):
+            checkpoints_of(out, other, settings, None, True)
 
 
 def test_a_place_with_other_files_is_refused_before_the_work(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
