@@ -215,8 +215,20 @@ def test_curve_joins_our_budgets_and_names_all() -> None:
 
 
 def test_a_run_is_of_the_files_that_it_was_made_from(tmp_path: Path) -> None:
-    (tmp_path / "001.png").write_bytes(b"one")
-    first = state(tmp_path)
-    assert state(tmp_path) == first
-    (tmp_path / "001.png").write_bytes(b"other")
-    assert state(tmp_path) != first
+    capture, linked, listed = tmp_path / "capture", tmp_path / "linked", tmp_path / "lights.json"
+    for folder in (capture / "view_01", linked):
+        folder.mkdir(parents=True)
+        (folder / "001.png").write_bytes(b"one")
+    (capture / "view_02").symlink_to(linked)
+    listed.write_text('{"view_01": [1]}')
+    options = ["--seed=1", "--views=" + ",".join(map(str, range(1, 200))), f"--lights={listed}"]
+    before = state(capture, options)
+    assert state(capture, options) == before
+    for file in (capture / "view_01" / "001.png", linked / "001.png", listed):
+        file.write_bytes(b"other")
+        after = state(capture, options)
+        assert after != before
+        before = after
+    (capture / "out" / "hull").mkdir(parents=True)
+    (capture / "out" / "runs.json").write_text("{}")
+    assert state(capture, options) == before, "a comparison in the capture's folder is none of its files"

@@ -76,7 +76,7 @@ def run_all(
     if out.exists() and any(out.iterdir()) and not (out / RUNS).exists():
         raise CaptureError(f"{out}: wanted a new or empty folder or an earlier comparison, given a folder with other files")
     out.mkdir(parents=True, exist_ok=True)
-    runs, place, made_of = known_runs(out), shown(capture.resolve()), state(capture)
+    runs, place, made_of = known_runs(out), shown(capture.resolve()), state(capture, options)
     # What is interrupted in its first run is an earlier comparison too.
     write_json(out / RUNS, {method: asdict(run) for method, run in runs.items()})
     for name in methods:
@@ -91,12 +91,16 @@ def run_all(
     return runs
 
 
-def state(capture: Path) -> str:
-    """Hash of the program, and of the capture's files by name, size and time: of another state a run is another."""
+def state(capture: Path, options: Sequence[str] = ()) -> str:
+    """Hash of the program, of the capture's files by name, size and time, and of what a file among the options (--lights) holds: of another
+    state a run is another. The comparison itself may lie in the capture's folder; what views link to counts."""
     digest = hashlib.blake2b(program().encode(), digest_size=16)
-    for path in sorted(path for path in capture.rglob("*") if path.is_file()):
+    for path in sorted(path for files in ("*", "view_*/*") for path in capture.glob(files) if path.is_file()):
         about = path.stat()
         digest.update(repr((str(path.relative_to(capture)), about.st_size, about.st_mtime_ns)).encode("utf-8", "surrogateescape"))
+    for value in (option.partition("=")[2] for option in options):
+        if os.path.isfile(value):
+            digest.update(read_file(Path(value), JSON_LIMIT))
     return digest.hexdigest()
 
 
