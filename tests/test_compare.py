@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -113,6 +114,16 @@ def test_another_capture_is_not_told_anothers_figures(capture: Path, tmp_path: P
 def test_bad_options(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str) -> None:
     assert run(main, [str(capture), *options, "--out", str(tmp_path / "out")]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("folder", ["-made", os.fsdecode(b"caf\xe9"), "."])
+def test_any_name_of_a_folder(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str) -> None:
+    place = tmp_path / "here" / folder
+    shutil.copytree(capture, place)
+    monkeypatch.chdir(tmp_path / "here")
+    assert run(main, [f"./{folder}", "--methods", "hull", "--out", "./-out", "--quiet"]) == 0
+    title = {"-made": "-made", ".": "here"}.get(folder, "caf\\xe9")
+    assert f"<title>Methods on {title}</title>" in (tmp_path / "here" / "-out" / "report.html").read_text()
 
 
 def test_a_capture_that_no_method_can_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

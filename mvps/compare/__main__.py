@@ -10,6 +10,7 @@ from typing import Any
 from mvps.command import parse, parser, run
 from mvps.evaluate import PROTOCOLS, protocol_list
 from mvps.folders import write_whole
+from mvps.inputs import shown
 from mvps.methods import BUDGETS, METHODS, OPTIONS, listed_methods
 from mvps.progress import Progress
 from mvps.published import AVERAGE, DILIGENT_OBJECTS, diligent_object
@@ -94,7 +95,9 @@ def main(argv: Sequence[str]) -> None:
     texts = {name: getattr(given, name.replace("-", "_"), None) for name in OPTIONS}
     options = [f"--{name}={text}" for name, text in texts.items() if text is not None]
     methods = tuple(dict.fromkeys((*given.methods, *(BUDGETS if given.curve else ()))))
-    printed = given.published or diligent_object(given.capture.name, *capture_size(given.capture))
+    # As in a result: "." has a name too, and what is no UTF-8 in it can be written.
+    capture_name = shown(Path(given.capture.resolve().name))
+    printed = given.published or diligent_object(capture_name, *capture_size(given.capture))
     protocols = given.protocols or (tuple(PROTOCOLS) if printed else ("ours",))
     runs = run_all(given.capture, methods, options, given.out, Progress(), protocols)
     chosen = [runs[name] for name in methods]
@@ -111,7 +114,7 @@ def main(argv: Sequence[str]) -> None:
     print(write_tables(tables, given.out))
     picture = given.out / "normals.png"
     headed = {heading(name): lines for name, lines in tables.items()}
-    page = page_html(given.capture.name, headed, curves, picture.read_bytes() if picture.exists() else None)
+    page = page_html(capture_name, headed, curves, picture.read_bytes() if picture.exists() else None)
     write_whole(given.out / "report.html", page)
 
 

@@ -106,7 +106,8 @@ def state(capture: Path, options: Sequence[str] = ()) -> str:
 
 def _run(capture: Path, name: str, options: Sequence[str], folder: Path) -> Run:
     """One method, not measured yet. KeyboardInterrupt where the user interrupts it."""
-    command = [sys.executable, "-m", "mvps.methods", str(capture), "--method", name, "--out", str(folder), *options]
+    # Names of folders may begin as options do.
+    command = [sys.executable, "-m", "mvps.methods", f"--method={name}", f"--out={folder}", *options, "--", str(capture)]
     start = time.perf_counter()
     with tempfile.TemporaryFile("w+", encoding="utf-8") as complaints:
         process = None
