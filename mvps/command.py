@@ -250,6 +250,17 @@ def whole(text: str) -> int:
     return int(text)
 
 
+DEVICES = ("auto", "cpu", "cuda")
+"""Where torch may be asked to compute."""
+
+
+def device_name(text: str) -> str:
+    """One of DEVICES."""
+    if text not in DEVICES:
+        raise argparse.ArgumentTypeError(f"wanted one of {', '.join(DEVICES)}, given {text!r}")
+    return text
+
+
 def _number(text: str) -> float:
     try:
         return float(text)

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mvps.command import lights_argument, number_list, parse, parser, run, whole
+from mvps.command import device_name, lights_argument, number_list, parse, parser, run, whole
 from mvps.finding import Finding
 from mvps.inputs import shown
 from mvps.progress import Progress
@@ -188,7 +188,7 @@ OPTIONS: dict[str, tuple[Callable[[str], Any], Any, str]] = {
     "views": (number_list, (), "numbers of the views to read, counted from 1; all if not given"),
     "lights": (lights_argument, (), "numbers of the lights, or a JSON file with a list per view"),
     "hold-out-views": (number_list, (), "views kept back for evaluation"),
-    "device": (str, "auto", "where torch computes: auto, cpu or cuda"),
+    "device": (device_name, "auto", "where torch computes: auto, cpu or cuda"),
     "seed": (whole, 0, "of all random draws"),
 }
 """What every method takes: type, default, help by name."""

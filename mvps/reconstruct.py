@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING, Any
 
-from mvps.command import lights_argument, number_list, parse, parser, positive, run, whole
+from mvps.command import DEVICES, lights_argument, number_list, parse, parser, positive, run, whole
 from mvps.finding import Finding
 from mvps.inputs import shown
 from mvps.memory import keep_below
@@ -251,7 +251,7 @@ def main(argv: Sequence[str]) -> None:
     made.add_argument("--hold-out-views", type=number_list, default=(), help="views kept back for evaluation")
     made.add_argument("--hold-out-lights", type=number_list, default=(), help="lights kept back for evaluation")
     made.add_argument("--calibrated-lights", action="store_true", help="use the lights given with the capture instead of solving them")
-    made.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where torch computes")
+    made.add_argument("--device", choices=DEVICES, default="auto", help="where torch computes")
     made.add_argument("--max-memory", type=positive, metavar="GB", help="keep the resident set below, or end with what it takes")
     made.add_argument("--seed", type=whole, default=0, help="of all random draws")
     made.add_argument("--faces", type=face_counts, default=(), metavar="N,N", help=FACES_HELP)

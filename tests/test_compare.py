@@ -109,6 +109,7 @@ def test_another_capture_is_not_told_anothers_figures(capture: Path, tmp_path: P
     [
         (["--methods", "ours,magic"], "wanted some of ours"),
         (["--methods", "hull", "--views", "0"], "wanted numbers from 1"),
+        (["--methods", "hull", "--device", "gpu"], "wanted one of auto, cpu, cuda, given 'gpu'"),
     ],
 )
 def test_bad_options(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said: str) -> None:
