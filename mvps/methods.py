@@ -168,9 +168,11 @@ BUDGETS = ("draft-2x", "ours-draft", "draft-0.7x", "standard-1.4x", "ours", "our
 def run_method(path: Path, name: str, settings: Settings, out: Path) -> None:
     """Read the capture, run the method and write its result folder. CaptureError where the method cannot run on it."""
     from mvps.export import write_reconstruction
+    from mvps.folders import CHECKPOINT, RESULT_MARKS, check_place
     from mvps.load import read_calibrated_lights, read_capture
     from mvps.sound import sound
 
+    check_place(out.resolve(), RESULT_MARKS, CHECKPOINT)
     method, progress = METHODS[name], Progress()
     with progress.stage("load"):
         capture = read_capture(path, settings.views or None, settings.lights or None)

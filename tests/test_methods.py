@@ -15,7 +15,7 @@ from mvps.finding import Finding
 from mvps.load import read_capture
 from mvps.methods import run_method
 from mvps.reconstruct import Settings, main
-from mvps.scene import Capture
+from mvps.scene import Capture, CaptureError
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import render_capture
 from mvps.synthetic.settings import SceneSettings
@@ -63,6 +63,12 @@ def test_ours_is_as_doubtful_by_either_command(path: Path, tmp_path: Path, doubt
             assert (written[of].width, written[of].height) == (64, 64)
     said = capsys.readouterr().out
     assert "all views: masks are too small\n" in said and "all views: brightness falls off" in said
+
+
+def test_a_place_that_is_taken_is_refused_before_the_work(path: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(CaptureError, match="given a folder with other files"):
+        run_method(path / "no capture at all", "hull", Settings(str(path)), tmp_path)
 
 
 def test_what_was_found_is_told_with_other_methods_too(path: Path, tmp_path: Path, doubted: None) -> None:
