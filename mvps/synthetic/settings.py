@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+LARGEST_SIZE = 10_000
+"""Pixels: a capture's photographs have 100 megapixels at most."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +50,11 @@ class SceneSettings:
         for name in ("views", "lights", "size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: wanted at least 1, given {getattr(self, name)}")
-        for name in ("strength", "noise", "intensity_spread"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: wanted 0 or more, given {getattr(self, name)}")
+        if self.size > LARGEST_SIZE:
+            raise ValueError(f"size: wanted at most {LARGEST_SIZE}, given {self.size}")
+        for name in ("strength", "noise", "intensity_spread", "seed"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: wanted 0 or more, and finite, given {getattr(self, name)}")
         if not 0 <= self.spread < 90:
             raise ValueError(f"spread: wanted degrees in [0, 90), given {self.spread}")
         if not self.extent > 0:
