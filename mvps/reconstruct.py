@@ -73,6 +73,9 @@ def parted(capture: Capture, hold_out_views: Numbers, hold_out_lights: Numbers) 
     views = {int(view.name[5:]) for view in capture.views}
     lights = {number for view in capture.views for number in view.lights}
     for what, wanted, there in (("views", hold_out_views, views), ("lights", hold_out_lights, lights)):
+        if len(set(wanted)) < len(wanted):
+            given = ",".join(map(str, wanted))
+            raise CaptureError(f"--hold-out-{what}: wanted each number once, given {given}; remove the repeated one")
         unknown = sorted(set(wanted) - there)
         if unknown:
             raise CaptureError(f"--hold-out-{what}: wanted some of {', '.join(map(str, sorted(there)))}, given {unknown[0]}")

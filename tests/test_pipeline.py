@@ -233,6 +233,8 @@ def test_bad_input_is_refused_and_leaves_nothing(capture: Path, tmp_path: Path, 
     assert all(line.startswith("mvps: ") for line in said.strip().splitlines() if "wanted" in line) and said.count("wanted") == 4
     assert run(reconstruct.main, [str(capture), "--out", str(out), "--hold-out-lights", "3,99", "--quiet"]) == 2
     assert "--hold-out-lights: wanted some of 1, 2, " in capsys.readouterr().err
+    assert run(reconstruct.main, [str(capture), "--out", str(out), "--hold-out-views", "2,1,2", "--quiet"]) == 2
+    assert "--hold-out-views: wanted each number once, given 2,1,2" in capsys.readouterr().err
     assert run(reconstruct.main, [str(capture), "--out", str(out), "--faces", "500,3", "--quiet"]) == 2
     assert "--faces: wanted 4 faces or more" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
