@@ -77,6 +77,16 @@ def test_calibrated_lights_are_matched_by_number(with_truth: Path) -> None:
     assert not lights.one_rig
 
 
+def test_lights_as_windows_writes_them(with_truth: Path) -> None:
+    capture = read_capture(with_truth)
+    before = read_calibrated_lights(with_truth, capture)
+    for table in with_truth.glob("view_*/light_*.txt"):
+        table.write_bytes(b"\xef\xbb\xbf" + table.read_bytes().replace(b"\n", b"\r\n"))
+    after = read_calibrated_lights(with_truth, capture)
+    for name in ("direction", "intensity"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+
+
 @pytest.mark.parametrize(("angle", "one_rig"), [(0.0, True), (5e-4, True), (2e-3, False)])
 def test_one_rig_within_a_milliradian(with_truth: Path, angle: float, one_rig: bool) -> None:
     turned = [[np.sin(angle), 0, np.cos(angle)], [0.6, 0, 0.8], [0, 0.6, 0.8]]

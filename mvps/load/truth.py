@@ -155,7 +155,7 @@ def _table(path: Path, positive: bool) -> Float:
     """(lights, 3) finite numbers."""
     text = read_bytes(path, "three numbers per light", "provide the file, or leave the calibrated lights out", most=TEXT_LIMIT)
     try:
-        table = np.array([[float(word) for word in line.split()] for line in text.decode().splitlines() if line.strip()])
+        table = np.array([[float(word) for word in line.split()] for line in text.decode("utf-8-sig").splitlines() if line.strip()])
     except ValueError as error:
         raise complaint(path, "three numbers per line", f"text that is none ({error})", "correct the file") from None
     if table.ndim != 2 or table.shape[1] != 3 or not (np.abs(table) < LARGEST).all() or (positive and (table <= 0).any()):
