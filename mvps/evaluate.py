@@ -163,7 +163,7 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
     """
     from mvps.export import read_reconstruction
     from mvps.load import read_truth
-    from mvps.measures import figures_of, perceptual_distance
+    from mvps.measures import figures_of, perceptual_distance, seen_from_outside
     from mvps.same_object import was_mended
     from mvps.scene import CaptureError
 
@@ -177,6 +177,8 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
     capture = read_views(truth, reconstruction, true_values)
     if was_mended(reconstruction):
         true_values = read_truth(truth, {view.name: view.camera for view in capture.views})
+    if true_values.surface is not None:
+        true_values = replace(true_values, surface=seen_from_outside(true_values.surface, capture))
     errors: dict[str, float] = {}
     for protocol in protocols:
         errors |= figures_of(protocol, reconstruction, capture, true_values, support_height(capture, true_values), perceptual)

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from mvps.command import run
-from mvps.evaluate import PROTOCOLS, ROWS, main, protocol_list, read_views, support_height, table, write_json
+from mvps.evaluate import PROTOCOLS, ROWS, evaluate_result, main, protocol_list, read_views, support_height, table, write_json
 from mvps.export import read_reconstruction, write_reconstruction
 from mvps.load import read_truth
 from mvps.mesh import vertex_normals
+from mvps.meshfile import ply_bytes, read_ply
 from mvps.scene import Camera, Capture, Reconstruction, Surface, Truth, View
 from mvps.synthetic.files import write_capture
 from mvps.synthetic.scene import make_scene, render_capture
@@ -179,6 +180,16 @@ def test_a_truth_of_nothing_but_intensities_is_measured(folders: tuple[Path, Pat
     kept = json.loads((result / "metrics.json").read_text())["truth"]
     assert {key for key in kept if not key.startswith("psnerf_")} == set(errors), "figures of another truth are gone"
     assert "psnerf_chamfer" in kept, "another protocol's stay"
+
+
+def test_a_true_mesh_whose_faces_look_inwards(folders: tuple[Path, Path], result: Path, tmp_path: Path) -> None:
+    turned = shutil.copytree(folders[0], tmp_path / "turned")
+    mesh = read_ply(turned / "mesh_Gt.ply")
+    (turned / "mesh_Gt.ply").write_bytes(ply_bytes(mesh._replace(faces=mesh.faces[:, ::-1]), "ground truth"))
+    right, other = (evaluate_result(result, truth, ("ours", "rnbneus")) for truth in (folders[0], turned))
+    assert other["offset_px"] == pytest.approx(right["offset_px"]) and right["offset_px"] > 0
+    key = "rnbneus_low_visibility_chamfer_mm"
+    assert other[key] == pytest.approx(right[key])
 
 
 def test_a_file_that_cannot_be_written_whole_stays_as_it_was(tmp_path: Path) -> None:

@@ -71,6 +71,14 @@ def test_signs_are_right_everywhere_around_a_coarse_sphere() -> None:
     assert (distance[inside] <= 10).all()
 
 
+@pytest.mark.parametrize("surface", [sphere(10, 2), plane(-20, 20, 0)])
+def test_a_truth_that_shows_its_back_is_turned_around(surface: Surface) -> None:
+    capture = seen(surface, [LOOKING_DOWN])
+    assert measures.seen_from_outside(surface, capture) is surface
+    turned = measures.seen_from_outside(Surface(surface.vertices, surface.faces[:, ::-1]), capture)
+    np.testing.assert_array_equal(turned.faces, surface.faces)
+
+
 def test_a_face_without_area_does_no_harm() -> None:
     ball = sphere(10, 2)
     a, b, _ = ball.faces[0]

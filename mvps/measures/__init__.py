@@ -28,6 +28,7 @@ from mvps.measures.ours import (
     mesh_normals,
     normal_errors,
     object_centre,
+    seen_from_outside,
     surface_errors,
 )
 from mvps.measures.protocols import (
@@ -75,6 +76,7 @@ __all__ = [
     "psnr_db",
     "rnbneus_errors",
     "rnbneus_normal_error",
+    "seen_from_outside",
     "similarity",
     "supernormal_errors",
     "surface_errors",

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from mvps.camera import pixel_footprint
+from mvps.camera import pixel_footprint, view_directions
 from mvps.measures.images import photograph_errors
 from mvps.measures.lights import by_photograph, held_out_photographs, held_out_views, light_errors, true_lights, unseen_views
 from mvps.measures.points import f_score
-from mvps.mesh import angles_deg, nearest, normalise, vertex_normals
+from mvps.mesh import angles_deg, centres, face_normals, nearest, normalise, vertex_normals
 from mvps.scene import Capture, CaptureError, Float, Material, Reconstruction, Surface, Truth, View, expected_error_deg
 from mvps.visibility import Hits, RayCaster, camera_hits, interpolate, ray_caster
 
@@ -45,6 +45,18 @@ def first_hit_points(surface: Surface, capture: Capture) -> Float:
         hits = camera_hits(caster, view.camera, view.pixels)
         points.append(interpolate(surface, hits, surface.vertices)[hits.face >= 0])
     return np.concatenate(points)
+
+
+def seen_from_outside(surface: Surface, capture: Capture) -> Surface:
+    """The surface, its faces turned around where cameras see mostly their backs: of a true mesh whose corners are ordered the other way
+    inside would be outside, and its vertices hidden."""
+    caster, fronts, seen = ray_caster(surface), 0, 0
+    for view in capture.views:
+        face = camera_hits(caster, view.camera, view.pixels).face
+        face = face[face >= 0]
+        towards = view_directions(view.camera, centres(surface)[face])
+        fronts, seen = fronts + int(((face_normals(surface)[face] * towards).sum(1) > 0).sum()), seen + len(face)
+    return surface if 2 * fronts >= seen else Surface(surface.vertices, surface.faces[:, ::-1])
 
 
 def distance_to(points: Float, surface: Surface) -> tuple[Float, Float]:
