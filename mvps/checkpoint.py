@@ -1,7 +1,7 @@
 """What stages came to, kept in the result's folder, so that an interrupted run can go on.
 
 A value is one NPZ file: its arrays, and a JSON text that says how they make up tuples, lists, mappings, tensors and frozen values. Reading
-executes nothing. A file appears whole. run.json beside them says of which run they are: only the same run goes on from them.
+executes nothing. A file appears whole. Each says of which run it is, as run.json beside them does: only the same run goes on from them.
 """
 
 from __future__ import annotations
@@ -114,12 +114,14 @@ class Checkpoints:
         """What `make` returns: read where it was kept, else made and kept, with the stages that it added to the progress."""
         path = self._folder / f"{name.replace(' ', '-')}.npz"
         if path.exists():
-            value, stages = self._read(path)
-            progress.stages.extend(stages)
-            return value  # type: ignore[no-any-return]
+            run, value, stages = self._read(path)
+            # Another one may be under way in the same folder.
+            if run == self._run:
+                progress.stages.extend(stages)
+                return value  # type: ignore[no-any-return]
         before = len(progress.stages)
         value = make()
-        self._write(path, (value, progress.stages[before:]))
+        self._write(path, (self._run, value, progress.stages[before:]))
         return value
 
     def _read(self, path: Path) -> Any:

@@ -52,6 +52,13 @@ def test_another_run_a_damaged_file_and_no_resume(tmp_path: Path) -> None:
     assert kept(tmp_path / "c", resume=False).step("a", lambda: 3, Progress()) == 3
 
 
+def test_two_runs_in_one_folder_stay_apart(tmp_path: Path) -> None:
+    first, second = (kept(tmp_path / "c", resume=False, of=name) for name in ("first", "second"))
+    assert first.step("a", lambda: 1, Progress()) == 1
+    assert second.step("a", lambda: 2, Progress()) == 2
+    assert first.step("a", lambda: 3, Progress()) == 3
+
+
 def test_another_version_of_the_program_is_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
