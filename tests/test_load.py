@@ -106,6 +106,14 @@ def test_filenames_give_the_order(capture: Path) -> None:
     np.testing.assert_array_equal(read_capture(capture).views[0].samples, everything.views[0].samples[:, [2, 0, 1]])
 
 
+def test_a_view_may_be_a_link_to_its_folder(capture: Path, tmp_path: Path) -> None:
+    (capture / "view_01" / "filenames.txt").write_text("003.png\n001.png\n002.png\n")
+    before = read_capture(capture)
+    (capture / "view_01").rename(tmp_path / "elsewhere")
+    (capture / "view_01").symlink_to(tmp_path / "elsewhere")
+    np.testing.assert_array_equal(read_capture(capture).views[0].samples, before.views[0].samples)
+
+
 def test_eight_bits_grey_and_transparency(capture: Path) -> None:
     folder = capture / "view_01"
     images = [photograph(1, light, np.uint8) for light in (1, 2, 3)]

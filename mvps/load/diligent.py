@@ -196,7 +196,8 @@ def _photographs(root: Path, folder: Path) -> list[Path]:
 
 
 def _listed_names(root: Path, listing: Path) -> list[str]:
-    """The lines of filenames.txt. It comes from whoever made the capture: it may name no file outside of it."""
+    """The lines of filenames.txt. It comes from whoever made the capture: it may name no file outside of it. Where the view's folder is a
+    link, it may name those beside it."""
     try:
         text = read_bytes(listing, "names of photographs", "remove the file to use the order of the names", most=TEXT_LIMIT).decode(
             "utf-8-sig"
@@ -207,6 +208,7 @@ def _listed_names(root: Path, listing: Path) -> list[str]:
     if not lines:
         raise complaint(listing, "at least one name", "none", "remove the file to use the order of the names")
     seen: set[str] = set()
+    places = root.resolve(), os.path.realpath(listing.parent)
     for number, name in lines:
         where = Path(f"{listing}, line {number}")
         if name in (".", "..") or "/" in name or "\\" in name or "\0" in name or ":" in name or len(os.fsencode(name)) > LONGEST_NAME:
@@ -214,7 +216,8 @@ def _listed_names(root: Path, listing: Path) -> list[str]:
         if name in seen:
             raise complaint(where, "every name once", f"{name} again", "remove the line")
         # Unlike Path.resolve this ends at a link to itself, which reading refuses.
-        if not Path(os.path.realpath(listing.parent / name)).is_relative_to(root.resolve()):
+        real = Path(os.path.realpath(listing.parent / name))
+        if not any(real.is_relative_to(place) for place in places):
             raise complaint(where, "a file of this capture", f"{name}, a link that leads out of it", "copy the photograph into the capture")
         seen.add(name)
     return [name for _, name in lines]
