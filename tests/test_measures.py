@@ -272,6 +272,11 @@ def test_what_is_held_out_gets_its_own_figures() -> None:
     assert errors["held_out_lights_psnr_db"] == pytest.approx(40, abs=0.2)
 
 
+def test_views_of_other_names_are_not_held_out_by_number() -> None:
+    made, _, _ = reconstruction({"hold_out_views": [2, 10]})
+    assert measures.held_out_views(replace(made, views=("view_010", "front"))) == ("view_010",)
+
+
 def test_a_view_that_the_result_never_saw_counts_as_held_out() -> None:
     made, capture, truth = reconstruction({})
     first = slice(0, 1)

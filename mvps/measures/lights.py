@@ -66,8 +66,9 @@ def light_errors(estimated: Mapping[Photograph, Light], truth: Mapping[Photograp
 
 def held_out_views(reconstruction: Reconstruction) -> tuple[str, ...]:
     """Names of the views in the result that were held out (settings: hold_out_views, numbers counted from 1)."""
-    numbers = reconstruction.settings.get("hold_out_views") or []
-    return tuple(view for view in reconstruction.views if int(view.rpartition("_")[2]) in numbers)
+    numbers = {str(number) for number in reconstruction.settings.get("hold_out_views") or []}
+    # A result may have views of other names, which no number means.
+    return tuple(view for view in reconstruction.views if view.rpartition("_")[2].lstrip("0") in numbers)
 
 
 def unseen_views(reconstruction: Reconstruction, capture: Capture) -> frozenset[str]:
