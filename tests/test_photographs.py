@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from sphere_scene import camera_at
 
-from mvps.checks.photographs import FOREIGN, photographs
+from mvps.checks.photographs import RELATED, photographs
 from mvps.joint.colours import _ratios
 from mvps.pixel_samples import colour_ratios
 from mvps.scene import Capture, View
@@ -133,14 +133,14 @@ def smooth_ball(rng: np.random.Generator, odd: bool) -> View:
     return View("view", camera_at(np.array([0.0, 0.0, 1.0])), mask, samples, 1 / 65535, 65535, tuple(range(1, 13)))
 
 
-@pytest.mark.parametrize("foreign", [0.0, FOREIGN])
-def test_a_smooth_object_under_another_light_is_no_other_object(foreign: float, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("related", [1.0, RELATED])
+def test_a_smooth_object_under_another_light_is_no_other_object(related: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Moving it changes little and it has no edges, but its light and dark lie where they are predicted."""
-    monkeypatch.setattr("mvps.checks.photographs.FOREIGN", foreign)
+    monkeypatch.setattr("mvps.checks.photographs.RELATED", related)
     rng = np.random.default_rng(0)
     capture = Capture("ball", tuple(replace(smooth_ball(rng, k == VIEW), name=f"view_{k}") for k in range(6)))
     told = [one.where for one in photographs(capture)[1] if "another object" in one.text]
-    assert told == ([f"view_{VIEW}/{LIGHT + 1:03d}"] if foreign == 0 else [])
+    assert told == ([f"view_{VIEW}/{LIGHT + 1:03d}"] if related == 1 else [])
 
 
 @pytest.mark.parametrize(("one", "other"), [(3, 7), (5, 8), (2, 12)])

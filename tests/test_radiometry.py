@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mvps.checks.photographs import photographs
-from mvps.checks.radiometry import CURVES, LINEAR, PIXELS, _rho, curve_undone, is_metal, left_in, linear
+from mvps.checks.radiometry import CURVES, LINEAR, SWEEPS, _rho, curve_undone, is_metal, left_in, linear
 from mvps.load import read_capture
 from mvps.scene import Capture
 from mvps.synthetic.scene import make_scene, render_capture
@@ -55,7 +55,7 @@ def test_a_curve_is_undone(name: str, bits: int) -> None:
 
 
 def test_a_metal_has_no_curve_and_no_black_photographs() -> None:
-    settings = SceneSettings(views=6, lights=10, size=96, exposure=0.98)
+    settings = SceneSettings(views=8, lights=10, size=128, exposure=0.98)
     scene = make_scene(settings)
     weight = np.tile([0.4, 1.0], (len(scene.material.albedo), 1))
     metal = replace(scene.material, albedo=0 * scene.material.albedo, specular_weight=weight)
@@ -94,4 +94,4 @@ def test_pixels_that_few_lamps_light_say_nothing() -> None:
         order = np.argsort(np.argsort(-view.samples.mean(-1), axis=1), axis=1)
         views.append(replace(view, samples=np.where((order < 4)[..., None], view.samples, 0).astype(np.uint16)))
     raking = Capture(capture.name, tuple(views))
-    assert left_in(raking) is None and np.isnan([_rho(view, LINEAR, PIXELS) for view in views]).all()
+    assert left_in(raking) is None and np.isnan([_rho(view, LINEAR, SWEEPS) for view in views]).all()

@@ -6,8 +6,10 @@ suspect                  b = log(r_0 / median of r_d on a ring) is -1 to -4 for 
                          capture (outliers.py).
 moved                    A suspect whose edges (edges.py) agree twice as well with those of the others when it is moved.
 another object or view   A suspect whose detail is not the object's, so that moving it changes nothing: b is 0 within the spread of r_d
-                         around the ring, its edges agree in place less than half as well as elsewhere, and r_0 is over half of what its
-                         pixels would leave in each other's places. (Of a smooth ball moving changes little either.)
+                         around the ring, its edges agree in place less than half as well as elsewhere, and where it is lit the
+                         prediction, times whatever factor, leaves most of its variance. (Of a smooth ball moving changes little
+                         either; and most of what a raking lamp shows of a sheet or a ring is shadow, which nothing predicts, and its
+                         bright level that of an edge.)
 black                    Its level is below the part of the view's photographs that predictions leave, its highlights are dark too, and it
                          shows nothing of the object, or its light is not weak in other views of a rig.
 another light            In a rig (rig.py).
@@ -23,7 +25,7 @@ import numpy as np
 
 from mvps.checks.edges import agreement
 from mvps.checks.outliers import outliers
-from mvps.checks.prediction import LIT, PIXELS, RIDGES, Sampled, coefficients, grey, medians, sampled, shifted
+from mvps.checks.prediction import FEWEST_PIXELS, LIT, PIXELS, RIDGES, Sampled, coefficients, grey, medians, sampled, shifted
 from mvps.checks.rig import rig_faults
 from mvps.cores import on_cores
 from mvps.finding import Finding
@@ -44,9 +46,8 @@ UNRELATED = 2.5
 SURELY = 4.0
 """Standard deviations that the best of the (2 reach + 1)^2 places must reach: chance reaches 2.7 to 3.5."""
 
-FOREIGN = 0.5
-"""Of what a photograph's pixels leave in each other's places, what one leaves at least that shows something else: nine of other objects
-left 0.70 to 1.13, one of a hollow ball that was taken for such 0.23 (docs/findings/checks.md)."""
+RELATED = 0.5
+"""Of the variance of a photograph's lit pixels, what its prediction explains at least if it shows the object."""
 
 BLACK, HIGHLIGHTS = 0.05, 0.99
 """Part of the other photographs' highlights, a high quantile of their pixels: a lamp that has failed leaves a room's light and noise."""
@@ -87,12 +88,16 @@ def _predicted(of: Sampled) -> _Predicted:
     return _Predicted(of, residual, b, spread, best)
 
 
-def _anywhere(p: _Predicted, light: int) -> float:
-    """What a photograph would leave with its pixels in each other's places: the median over all pairs of them and of predicted ones."""
+def _resembles(p: _Predicted, light: int) -> bool:
+    """Whether a photograph's lit pixels are in proportion to their predictions, or too few to tell."""
     M = p.of.values
-    P = M @ coefficients(M.T @ M, RIDGES[p.ridge[light]])[:, light]
-    lit = P > LIT
-    return float(np.median(np.abs(M[lit, light][:, None] - P[lit][None]))) if lit.any() else 0.0
+    image, predicted = M[:, light], M @ coefficients(M.T @ M, RIDGES[p.ridge[light]])[:, light]
+    # Its own bright level may be of the little that it shows, and all else noise.
+    lit = (predicted > LIT) & (image * min(float(p.of.level[light]), 1.0) > LIT)
+    if lit.sum() < FEWEST_PIXELS:
+        return True
+    correlation = float(np.corrcoef(image[lit], predicted[lit])[0, 1])
+    return correlation > 0 and correlation**2 > RELATED
 
 
 def _fault(p: _Predicted, light: int, spread: float) -> str | None:
@@ -107,7 +112,7 @@ def _fault(p: _Predicted, light: int, spread: float) -> str | None:
         return None
     if best > SURELY * sigma and max(abs(row), abs(column)) > 1:
         return f"is moved by about {column} pixels to the right and {row} down against the view's other photographs"
-    if here < UNRELATED * sigma and p.b[light] > -UNRELATED * spread and p.residual[light] > FOREIGN * _anywhere(p, light):
+    if here < UNRELATED * sigma and p.b[light] > -UNRELATED * spread and not _resembles(p, light):
         return "shows another object or another view: the view's other photographs predict it no better in place than moved"
     return None
 

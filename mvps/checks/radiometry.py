@@ -1,15 +1,16 @@
 """A curve that was left in the photographs: found and undone.
 
 Where a pixel is lit, Lambert's law gives photographs of three factors (calibrate.py), I_pl = b_p . s_l. A display's curve,
-I -> I^(1/2.2) and its like, breaks that. So
+I -> I^(1/2.2) and its like, breaks that. So, with residuals in codes, what the photographs were recorded in,
 
-    rho(curve) = median |M - three factors| / median |M - the pixel's median|,   M = curve^-1(code) over the pixel's bright level,
+    rho(curve) = median |M - three factors| / (dM / dcode),   M = curve^-1(code) over the pixel's bright level,
 
-is least for the curve that was left in. Codes and radiances of a photograph are taken over their bright level in it: under lights of
-unequal strength a curve would else make the strongest all there is, which few factors explain. So rho depends neither on exposure nor
-albedo nor on the lights' strengths, and the samples that count, the brightest of each pixel, are the same for all curves. A curve is
-believed where undoing it lowers rho clearly, over all views and in most of them: gloss and inter-reflection do not look like one. Of
-metals, which no three factors explain, none is believed (correlation.py).
+is least for the curve that was left in. (In M itself an exponent that flattens or stretches photographs gains by that alone, and of flat
+faces, whose few normals are three factors under any curve, the noise decides: Box and Cox 1964.) Codes and radiances of a photograph are
+taken over their bright level in it: under lights of unequal strength a curve would else make the strongest all there is, which few factors
+explain. So rho depends neither on exposure nor albedo nor on the lights' strengths, and the samples that count, the brightest of each
+pixel, are the same for all curves. A curve is believed where undoing it lowers rho clearly, over all views and in most of them: gloss and
+inter-reflection do not look like one. Of metals, which no three factors explain, none is believed (correlation.py).
 """
 
 from __future__ import annotations
@@ -66,6 +67,12 @@ most pixels are lit by three to five, which three factors fit whatever they are.
 PIXELS, VIEWS, SWEEPS = 300, 8, 6
 """Looked at: rho is a median of some thousand samples a view."""
 
+ALL_SWEEPS = 20
+"""Where six speak for a curve: until factors of flat faces, which hardly tell the third, have come to rest."""
+
+GROWN = 1e-3
+"""Half the relative step of the difference quotient that stands for a curve's derivative."""
+
 FULL = 65535
 
 
@@ -75,26 +82,35 @@ def over_its_level(image: Float) -> Float:
     return image / np.maximum(level, 1e-12)
 
 
-def _rho(view: View, curve: Curve, pixels: int) -> float:
-    """rho of a view's photographs with a curve undone."""
-    chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:pixels])
+def _rho(view: View, curve: Curve, sweeps: int) -> float:
+    """rho of a view's photographs with a curve undone, over pixels' bright codes."""
+    chosen = np.sort(np.random.default_rng(0).permutation(len(view.pixels))[:PIXELS])
     codes = view.samples[chosen][:, view.shown]
-    image = over_its_level(curve(codes * view.scale).mean(-1))
-    order = np.argsort(np.argsort(over_its_level(codes.mean(-1)), axis=1), axis=1)
-    known = (codes < view.saturation).all(-1) & (order >= (1 - LIT_SHARE) * codes.shape[1]) & (codes.min(-1) > 0)
+    radiance = curve(codes * view.scale).mean(-1)
+    darker, brighter = (curve(codes * (view.scale * (1 + step))).mean(-1) for step in (-GROWN, GROWN))
+    image, code = over_its_level(radiance), over_its_level(codes.mean(-1))
+    known = (codes < view.saturation).all(-1) & (codes.min(-1) > 0)
+    known &= np.argsort(np.argsort(code, axis=1), axis=1) >= (1 - LIT_SHARE) * codes.shape[1]
     # Three factors fit fewer whatever they are.
     known &= known.sum(1, keepdims=True) >= FEWEST_KNOWN
     if known.any(1).mean() < KNOWN_SHARE:
         return float("nan")
-    bright = np.maximum(np.quantile(image, BRIGHT_QUANTILE, axis=1, keepdims=True), 1e-12)
-    M = image / bright
-    factors = factorise(M, known, 3, SWEEPS, floor=1e-4)
-    left = np.abs(M - factors.left @ factors.right.T)[known]
-    return float(np.median(left) / max(float(np.median(np.abs(M - np.median(M, 1, keepdims=True))[known])), 1e-12))
+    factors = factorise(image / _bright(image), known, 3, sweeps, floor=1e-4)
+    left = np.abs(image / _bright(image) - factors.left @ factors.right.T)
+    # In logarithms of both, which do without levels.
+    growth = (brighter - darker) / (2 * GROWN * np.maximum(radiance, 1e-12))
+    in_codes = left * _bright(image) / np.maximum(image * growth, 1e-12) * code / _bright(code)
+    return float(np.median(in_codes[known]))
 
 
-def _log_rho(views: list[View], curve: Curve) -> NDArray[np.float64]:
-    return np.log(np.maximum(on_cores(lambda view: _rho(view, curve, PIXELS), views), 1e-6))
+def _bright(values: Float) -> Float:
+    """(n, 1) bright level of pixels over the lights."""
+    level: Float = np.maximum(np.quantile(values, BRIGHT_QUANTILE, axis=1, keepdims=True), 1e-12)
+    return level
+
+
+def _log_rho(views: list[View], curve: Curve, sweeps: int) -> NDArray[np.float64]:
+    return np.log(np.maximum(on_cores(lambda view: _rho(view, curve, sweeps), views), 1e-6))
 
 
 def some_views(capture: Capture, lights: int) -> list[View]:
@@ -108,13 +124,12 @@ def left_in(capture: Capture) -> tuple[str, float] | None:
     some = some_views(capture, FEWEST_LIGHTS)
     if not some:
         return None
-    linear = _log_rho(some, LINEAR)
-    if np.isnan(linear).all():
-        return None
+    quick, one_of_them = (_log_rho(some, curve, SWEEPS) for curve in (LINEAR, CURVES["gamma 2.2"]))
     # The curves are alike: where one of them is no better than none, neither is another.
-    if not np.nanmean(linear - _log_rho(some, CURVES["gamma 2.2"])) > 0:
+    if np.isnan(quick).all() or not np.nanmean(quick - one_of_them) > 0:
         return None
-    better = {name: linear - _log_rho(some, curve) for name, curve in CURVES.items()}
+    linear = _log_rho(some, LINEAR, ALL_SWEEPS)
+    better = {name: linear - _log_rho(some, curve, ALL_SWEEPS) for name, curve in CURVES.items()}
     name = max(better, key=lambda name: float(np.nanmean(better[name])))
     gain = float(np.nanmean(better[name]))
     if gain < np.log(BETTER) or np.nanmedian(better[name] > 0) < 1:
