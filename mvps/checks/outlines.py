@@ -10,6 +10,10 @@ they belong, which is the second term.
 
 Outlines are cut into quarters, and two that do not touch are held out. A camera that is wrong shows in both halves; a mask's staircase does
 not, which a straight edge has along all of its length.
+
+Where a boundary runs along rows or columns of pixels it is off by the same part of a pixel, up to half of one, over its whole run, and in
+all views to which an upright object looks alike. There is no step of the staircase to average over: neither do points there say anything,
+nor misses that such a boundary of another view decides.
 """
 
 from __future__ import annotations
@@ -20,12 +24,14 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mvps.checks.coherence import Coherence, Fields, coherence, jacobian, outline_points
+from mvps.camera import project
+from mvps.checks.coherence import Coherence, Fields, coherence, gradients, jacobian, outline_points
 from mvps.cores import on_cores
 from mvps.hull import masks_box
 from mvps.motions import UNKNOWNS, Object, derivatives, gauge, moved, without_gauge
-from mvps.scene import Camera, Capture, Float
+from mvps.scene import Bool, Camera, Capture, Float
 from mvps.silhouette import STAIRCASE_PIXELS, mask_distances
 from solvers.low_rank import CAUCHY_95
 
@@ -39,6 +45,9 @@ largest of several."""
 LEAST_SPACING, MOST_POINTS = 4.0, 2000
 """Pixels between outline points: beyond three the smoothed staircase of a mask (silhouette.py) is another. Points of all views: a tenth of
 a second to follow their lines of sight through twenty views."""
+
+DECIDES = 0.25
+"""Weight from which a view has a part in deciding a miss."""
 
 PARTS = 4
 """Of a view's outline: with points of both halves beside each other right cameras of blocks and nuts were moved, with eighths of blocks too
@@ -77,7 +86,18 @@ class Outlines:
 
     def misses(self) -> list[Coherence]:
         """The misses of all views."""
-        return on_cores(lambda i: coherence(self.cameras, self.fields, self.body, i, self.points[i]), range(len(self.cameras)))
+        return on_cores(self._of_view, range(len(self.cameras)))
+
+    def _of_view(self, i: int) -> Coherence:
+        """Those of a view, at most 0 where a boundary decides that runs along pixels."""
+        found = coherence(self.cameras, self.fields, self.body, i, self.points[i])
+        untold = np.zeros(len(found.miss), bool)
+        for side in range(2):
+            decides = (found.miss > 0) & (found.weight[:, side] > DECIDES)
+            for j in np.unique(found.against[decides, side]):
+                rows = np.flatnonzero(decides & (found.against[:, side] == j))
+                untold[rows] |= along_pixels(self.fields[j], project(self.cameras[j], found.point[rows])[0])
+        return replace(found, miss=np.where(untold, 0.0, found.miss))
 
 
 class Unknowns(Protocol):
@@ -126,10 +146,24 @@ class Motions:
 def outlines_of(capture: Capture, body: Object | None = None) -> Outlines:
     """The outlines of all masks. body: where the object is, in the masks' box if None, with a CaptureError where they enclose none."""
     fields = mask_distances(capture)
-    points = on_cores(lambda field: outline_points(field, LEAST_SPACING), fields)
+    points = on_cores(_told_points, fields)
     every = -(-sum(len(of_view) for of_view in points) // MOST_POINTS) or 1
     within = body or Object.between(*masks_box(capture)[:2])
     return Outlines(tuple(view.camera for view in capture.views), fields, within, [of_view[::every] for of_view in points])
+
+
+def _told_points(field: NDArray[np.float32]) -> Float:
+    """(n, 2) points of a mask's outline, but for runs along pixels."""
+    points = outline_points(field, LEAST_SPACING)
+    told: Float = points[~along_pixels(field, points)]
+    return told
+
+
+def along_pixels(field: NDArray[np.float32], image: Float) -> Bool:
+    """(n,) whether the boundary of a mask with this signed distance runs along rows or columns of pixels at image coordinates (n, 2),
+    without a step as far as smoothing reaches: the distance then does not change along it at all."""
+    slope = np.abs(gradients(field, image))
+    return np.asarray(slope.min(1) <= np.finfo(np.float32).eps * slope.max(1))
 
 
 def positive(found: list[Coherence]) -> Float:

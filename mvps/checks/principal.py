@@ -3,7 +3,7 @@
 With c + s in place of c for the principal point all photographs shift by s pixels, as if every point at depth z of a camera's frame moved
 by (s_1 z / f_x, s_2 z / f_y, 0). Seen from all around that is no motion of the world, so the misses of outlines.py tell s: two unknowns
 where poses have six a view, and a world that stays where its cameras are. Of cameras on one ring a shift along its axis is a motion of the
-world all but for perspective. So s is looked for along the direction that misses tell best, then across it as well where that is certain;
+world all but for perspective. So s is looked for along the direction that misses tell best, then across it as well where both are sure;
 half of the outline points has to confirm what the other half wants.
 """
 
@@ -77,12 +77,13 @@ def _fitted(outlines: Outlines, axes: Float, tie: float) -> list[Float]:
     return [along, fitted(outlines, Shared(axes), np.append(along, 0.0), tie, np.inf)]
 
 
-def _error_across(outlines: Outlines, axes: Float, shift: Float, halves: Sequence[Float], tie: float) -> float:
-    """Standard error of the second coordinate of a shift: what masks' noise makes it, or what halves of the points do if that is more."""
+def _errors(outlines: Outlines, axes: Float, shift: Float, halves: Sequence[Float], tie: float) -> Float:
+    """(2,) standard errors of a shift: what masks' noise makes them, or what halves of the points do if that is more."""
     there = after(outlines, Shared(axes), shift)
     hessian, _ = equations(there, Shared(axes), there.misses())
-    by_noise = MASK_NOISE * np.sqrt(np.linalg.inv(hessian + tie * np.eye(2))[1, 1])
-    return float(max(by_noise, abs(halves[0][1] - halves[1][1]) / 2))
+    by_noise = MASK_NOISE * np.sqrt(np.diag(np.linalg.inv(hessian + tie * np.eye(2))))
+    errors: Float = np.maximum(by_noise, np.abs(halves[0] - halves[1]) / 2)
+    return errors
 
 
 def shift_of(outlines: Outlines) -> tuple[Float, int]:
@@ -92,8 +93,9 @@ def shift_of(outlines: Outlines) -> tuple[Float, int]:
     tie, axes = tie_of(found), _directions(outlines, found)
     halves = [outlines.half(k) for k in range(2)]
     shifts, of_halves = _fitted(outlines, axes, tie), [_fitted(half, axes, tie) for half in halves]
-    error = _error_across(outlines, axes, shifts[1], [both for _, both in of_halves], tie)
-    told = 2 if abs(shifts[1][1]) > CERTAIN * error else 1
+    certain = np.abs(shifts[1]) > CERTAIN * _errors(outlines, axes, shifts[1], [both for _, both in of_halves], tie)
+    # No shift lies along the ring's axis alone, but the rounding of an upright object's masks, alike in many views, may look so.
+    told = 2 if certain.all() else 1
     of = Shared(axes[:told])
     by_other = [after(half, of, one[told - 1]) for half, one in zip(halves, reversed(of_halves), strict=True)]
     before, then = ([one for half in way for one in half.misses()] for way in (halves, by_other))
