@@ -27,6 +27,10 @@ PROTOCOLS = {
 """Ways to measure, and whose they are; mvps/measures/protocols.py says each in full."""
 
 
+ACCOUNTS = ("metrics.json", "settings.json", "lights.json", "cameras.json")
+"""A result's own files of the kind that figures are written in."""
+
+
 class Row(NamedTuple):
     """A line of the table: what it is, the keys of its three columns (all views, fitted views, held-out views), its format.
 
@@ -185,6 +189,15 @@ def evaluate_result(result: Path, truth: Path, protocols: Sequence[str] = ("ours
     return errors
 
 
+def _check_json(path: Path, result: Path) -> None:
+    """CaptureError unless figures can be written at this place and take none of the result's own files away."""
+    from mvps.scene import CaptureError
+
+    check_file(path)
+    if path.resolve() in [(result / name).resolve() for name in ACCOUNTS]:
+        raise CaptureError(f"{path}: wanted a file for the figures alone, given one of the result's own; give another place")
+
+
 def has_truth(truth: Truth) -> bool:
     """Whether there is anything to measure against."""
     return truth.surface is not None or any((truth.normals, truth.direction, truth.intensity))
@@ -253,7 +266,7 @@ def main(argv: Sequence[str]) -> None:
     if "lpips_weights" in options and "psnerf" not in options.protocols:
         made.error(f"--lpips-weights: wanted psnerf among --protocols, given {','.join(options.protocols)}")
     if "json" in options:
-        check_file(options.json)
+        _check_json(options.json, options.result)
     errors = evaluate_result(options.result, options.truth, options.protocols, vars(options).get("lpips_weights"))
     from mvps.report import write_report
 

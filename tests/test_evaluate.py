@@ -164,9 +164,14 @@ def test_bad_input_is_one_sentence(folders: tuple[Path, Path], result: Path, tmp
     assert (result / "metrics.json").read_bytes() == before
 
     untouched = shutil.copytree(folders[1], tmp_path / "untouched")
-    for place, given in ((tmp_path / "missing" / "figures.json", "no such folder"), (tmp_path, "a folder")):
+    places = {
+        tmp_path / "missing" / "figures.json": "no such folder",
+        tmp_path: "a folder",
+        untouched / "metrics.json": "one of the result's own",
+    }
+    for place, given in places.items():
         said = complaint([str(untouched), "--truth", str(capture), "--json", str(place)], capsys)
-        assert said.startswith(f"mvps: {place}: wanted a file in a folder that is there") and f"given {given};" in said
+        assert said.startswith(f"mvps: {place}: wanted a file ") and f"given {given};" in said
         assert "truth" not in json.loads((untouched / "metrics.json").read_text()) and not (untouched / "report.html").exists()
 
 
